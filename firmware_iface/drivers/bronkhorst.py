@@ -75,7 +75,7 @@ class ParameterPort(Protocol):
         """A text."""
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
-        """Write, and know that the instrument has it."""
+        """Write, and verify that the instrument has it."""
 
     async def close(self) -> None:
         """Disconnect. Never raises."""
@@ -150,7 +150,7 @@ class BronkhorstFlow:
 class BronkhorstPressure:
     """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty: any."""
 
-    # below zero a little (noise), above full scale up to what the sensor can show (131.07 % of 32000 is 41942)
+    # slightly below zero (noise), above full scale up to the sensor's limit (131.07 % of 32000 is 41942)
     _FRACTIONS = (-0.1, 1.3107)
 
     def __init__(self, port: ParameterPort, serial: str = "") -> None:

@@ -94,7 +94,7 @@ def request(parameters: Sequence[InstrumentParameter]) -> bytes:
     for place, parameter in enumerate(parameters):
         more = 0x80 if place + 1 < len(parameters) else 0
         kind = _TYPES[parameter.kind]
-        # every parameter in a process group of its own: the place is both the group's and the parameter's index
+        # each parameter has its own process group: the place is both the group's and the parameter's index
         data += bytes([place | more, place | kind, parameter.process, parameter.number | kind])
         if parameter.kind == "text":
             data.append(parameter.chars)
@@ -143,7 +143,7 @@ def values(data: bytes) -> list[tuple[int, int, bytes]]:
 MANUAL = "Bronkhorst 9.17.027, sections 3.4 to 3.6"
 _QUIET_S = 0.1
 _ANSWER_BYTES = 50  # the longest: a text of 16 characters, or three floats, with every byte doubled
-# On a line with errors in a tenth of the messages, two copies are hit at the same bit once in a million
+# With errors in a tenth of the messages, the same bit flips in two copies once in a million
 _COPIES = 3
 _REFUSALS = (3, 4, 5, 6, 13)  # status: the request itself is wrong for this instrument
 _SEQUENCES = 256
@@ -171,7 +171,7 @@ class ProparParameters:
             self._exchange.connect()
 
     async def number(self, parameter: InstrumentParameter) -> float:
-        """A number that came `_COPIES` times the same. Raises LinkError."""
+        """A number that arrived `_COPIES` times the same. Raises LinkError."""
         first, *others = await self._asked(*[parameter] * _COPIES)
         if any(other != first for other in others):
             came = ", ".join(raw.hex() for raw in (first, *others))
@@ -179,7 +179,7 @@ class ProparParameters:
         return float(struct.unpack(_FORMATS[parameter.kind], first)[0])
 
     async def text(self, parameter: InstrumentParameter) -> str:
-        """A text that came twice. Raises LinkError."""
+        """A text that arrived twice the same. Raises LinkError."""
         first, second = (await self._asked(parameter))[0], (await self._asked(parameter))[0]
         if first != second:
             raise LinkError(f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise")
@@ -220,7 +220,7 @@ class ProparParameters:
         return [raw for _, _, raw in found]
 
     async def _transact(self, data: bytes, what: str) -> bytes:
-        """Data of the answer with the question's own sequence number; a status other than 0 is raised."""
+        """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
         question = self._question(data, what)
         fence = self._question(request([MEASURE]), f"{self.name}: asking anew after a loss")

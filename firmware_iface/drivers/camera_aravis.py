@@ -35,7 +35,7 @@ _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
 @dataclass(slots=True)
 class FrameCounts:
-    """Fate of the triggers: `taken` whole, `incomplete`, `missing` (nothing came), and `reconnects`."""
+    """Results of the triggers: `taken` whole, `incomplete`, `missing` (no frame came), and `reconnects`."""
 
     taken: int = 0
     incomplete: int = 0
@@ -47,7 +47,7 @@ class AravisCamera:
     """The camera; opened by the first exposure, and again by the next one after its link was lost.
 
     A sensor of another size than `width_px` and `height_px` is refused; `now` and `sleep` are the run's clock.
-    `counts` has the fate of the triggers.
+    `counts` has the results of the triggers.
     """
 
     def __init__(
@@ -212,8 +212,8 @@ class AravisCamera:
         size = tuple(number.value for number in region)
         self._must_be("x, y, width and height in px", size, (0, 0, *self._size))
         call("arv_camera_set_acquisition_mode", camera, _CONTINUOUS)
-        # every trigger that the camera has is cleared first; which selector there is (FrameStart, or only
-        # FrameBurstStart as on Hikrobot's cameras) is the library's to find
+        # every trigger of the camera is cleared first; the library finds the selector that exists (FrameStart, or
+        # only FrameBurstStart as on Hikrobot's cameras)
         call("arv_camera_set_trigger", camera, b"Software")
         self._must_be("trigger source", call("arv_camera_get_trigger_source", camera), b"Software")
         if call("arv_camera_is_exposure_auto_available", camera):

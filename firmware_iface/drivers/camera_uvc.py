@@ -1,8 +1,8 @@
 """USB cameras without GenICam (UVC) through OpenCV's VideoCapture: role Camera.
 
 Source: OpenCV 4 documentation, `cv::VideoCapture` and `VideoCaptureProperties`. Such a camera runs freely and keeps
-frames in a queue; a frame belongs to a pattern only if it started after the pattern was lit, so earlier frames are
-read and discarded.
+frames in a queue; a frame belongs to a pattern only if its exposure started after the pattern appeared, so earlier
+frames are read and discarded.
 """
 
 import time
@@ -14,7 +14,7 @@ import numpy as np
 
 from firmware_iface import roles, settings
 
-# One in the driver's queue, although its length is set to one, and one whose exposure had started
+# One in the driver's queue, although its length is set to one, and one whose exposure has started
 _STALE_FRAMES = 2
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
 

@@ -4,9 +4,9 @@ Manual: DL-RS1A user's manual, IL edition (96081E): settings page 7, commands pa
 error numbers page 16. A command ends in CR or CR LF, an answer in CR LF; CR alone is accepted too.
 
 `SR,ii,038` reads the internal value (R.V.) of amplifier ii: unlike the judgment value of `M0`, neither a zero shift
-at the amplifier's own keys nor a hold setting moves it, and its answer says what it answers. The protocol has no
-checksum. Even parity at the unit's switches (and here) stops most hit bytes; a value that differs from both before it
-by more than `step_max_um` is rejected; a smaller error passes as noise.
+at the amplifier's own keys nor a hold setting moves it, and its answer names its question. The protocol has no
+checksum. Even parity at the unit's switches (and here) stops most corrupted bytes; a value that differs from the two
+before it by more than `step_max_um` is rejected; a smaller error passes as noise.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         self._read_answer = re.compile(rf"(?:SR,{number},038,({_VALUE})|ER,SR,(\d\d))\r\n?")
         self._errors_command = f"SR,{number},033"
         self._errors_answer = re.compile(rf"(?:SR,{number},033,(\d{{5}})|ER,SR,(\d\d))\r\n?")
-        # the fence has to differ from a reading also when it is refused, as when the amplifier is pulled off: `M0`
+        # the fence must differ from a reading even when refused, as when the amplifier is pulled off: `M0`
         fence = exchange.LineFence("M0", _ALL, _ALL_CHARS)
         settings = serial_port.SerialSettings(config.baud, parity=config.parity)
         super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
@@ -76,7 +76,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         if _STEPS_UM[self._decimals] > self._config.step_max_um:
             raise roles.DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
         errors = await self._link.query(self._errors_command, self._errors_answer)
-        if errors[2] != _NOT_READABLE:  # amplifiers that do not tell: their head error is seen in the value
+        if errors[2] != _NOT_READABLE:  # amplifiers without this number: the value shows their head error
             _refuse(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
             raise roles.DeviceRefusedError(

@@ -28,7 +28,7 @@ class ValueMap:
     word_order: str = "big"  # of the two registers of a 32-bit type: "big" word first, or "little"
     # a holding register and its required content, if that identifies the device
     identity: tuple[int, int] | None = None
-    version_address: int | None = None  # a holding register with the device's version, to be shown
+    version_address: int | None = None  # a holding register with the device's version, for display
 
     @property
     def words(self) -> int:

@@ -1,8 +1,8 @@
 """Micro-Epsilon optoNCDT 1420 laser triangulation sensor on RS-422.
 
 Manual: optoNCDT 1420 instruction manual; commands in its appendix A 3 (pages 93-110), digital values and error codes
-in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends behind it are taken), an error is `Exxx`
-before that. It may repeat the command and write a rate as `4`, `4.0` or `4 kHz`.
+in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends after it are accepted), an error is `Exxx`
+before that. The answer may repeat the command and write a rate as `4`, `4.0` or `4 kHz`.
 
 The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
 of 80 values). A corrupted byte, which the protocol cannot detect, is one outlier among many and is dropped; and
@@ -10,8 +10,8 @@ unlike the median, the mean resolves less than a digital step (0.8 um at 50 mm r
 
 In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest bits: low `00`,
 middle `01`, high `10` for the first value of a measurement and `11` for further ones. Here a measurement is distance
-and measurement counter (`OUTADD_RS422 COUNTER`), six bytes. There is no checksum, and where bytes are lost two
-measurements can join to one that never was: a measurement is trusted only when its counter is the last one plus one.
+and measurement counter (`OUTADD_RS422 COUNTER`), six bytes. There is no checksum, and lost bytes can join two
+measurements to a false one: a measurement is trusted only when its counter is the last one plus one.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
 _RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
 _MIDDLE_MIN = 8  # the median for fewer values
-_BATCHES_MAX = 1024  # for an absent caller; old ones go first
+_BATCHES_MAX = 1024  # without a caller; old ones are dropped first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 _BYTES = 6  # a measurement
 _COUNTER_MODULUS = 2**18
@@ -41,8 +41,8 @@ _MARKS = (0, 1, 2, 0, 1, 3)
 class StreamParser:
     """Bytes in any portions to measurements.
 
-    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, which did not follow on
-    the one before.
+    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, whose counter did not
+    follow the one before.
     """
 
     def __init__(self) -> None:
@@ -84,9 +84,9 @@ def distance_mm(raw: float, range_mm: float) -> float:
 class Optoncdt1420:
     """A `DisplacementSensor`; `port` stands in for the configured one.
 
-    Displacement = direction * (distance - zero). The sensor stands behind the mirror: when the bowl deepens the
-    vertex comes nearer, so the default direction is -1. Counter and time are the driver's: trusted values so far,
-    time of arrival. A sensor that repeats itself repeats its counter too, and that is no new value.
+    Displacement = direction * (distance - zero). The sensor is behind the mirror: when the bowl deepens the vertex
+    comes nearer, so the default direction is -1. Counter and time are the driver's: trusted values so far, time of
+    arrival. A sensor that repeats a value repeats its counter too, so the value is not new.
     """
 
     def __init__(self, config: settings.Optoncdt1420Config, port: serial_port.SerialPort | None = None) -> None:
@@ -109,7 +109,7 @@ class Optoncdt1420:
         """Open the port, stop the stream, check its identity, set it and read it back, start the stream.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
-        range, or a setting that is not taken).
+        range, or a setting that the sensor does not take).
         """
         await self.close()
         self._settle_anew()
@@ -135,7 +135,7 @@ class Optoncdt1420:
             f"MEASRATE {self._config.rate_khz:g}",
             "LASERPOW FULL",
             "OUTREDUCEDEVICE NONE",
-            "OUTHOLD NONE",  # an error is to be seen, not the value before it
+            "OUTHOLD NONE",  # an error must show, not the value before it
             "OUTADD_RS422 COUNTER",
         ]
 
@@ -173,12 +173,12 @@ class Optoncdt1420:
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
-        if not self._heard.rstrip().endswith(_PROMPT):  # it may have come while this process was kept from running
+        if not self._heard.rstrip().endswith(_PROMPT):  # it may have arrived while this process was suspended
             hint = f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
             if self._heard:
                 hint = f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} s; wrong baud rate?"
             raise roles.LinkError(f"{what}: {hint}")
-        # bytes of a stream that is just being stopped have no text in them that could be an error: see the marks
+        # bytes of a stream that is just stopping contain no text that could be an error: see the marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
             raise roles.DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
@@ -194,10 +194,10 @@ class Optoncdt1420:
                 self._gate.passes(self._displacement_um(middle(good)))
 
     async def displacement(self) -> roles.DisplacementSample:
-        """Middle of all values since the last call; waits for one when there is none yet.
+        """Mean of the middle half of all values since the last call; waits for one when there is none yet.
 
-        Raises LinkError (no value in time, or one that cannot be: it is dropped), LinkDownError (the port is gone, or
-        the sensor stopped streaming: open it again).
+        Raises LinkError (no value in time, or an impossible one, which is dropped), LinkDownError (the port is gone,
+        or the sensor stopped streaming: open it again).
         """
         try:
             await self._wait_for_values()
@@ -284,7 +284,7 @@ class Optoncdt1420:
 
 
 def _plain(value: str) -> str:
-    """A rate without unit and needless zeros, anything else as it is."""
+    """A rate without unit and trailing zeros, anything else unchanged."""
     rate = _RATE.fullmatch(value)
     return f"{float(rate[1]):g}" if rate else value
 

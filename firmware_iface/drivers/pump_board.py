@@ -17,7 +17,7 @@ NO_CLAIM = (
 )
 _HEARTBEATS = 2**16
 _U32_MAX = 2**32 - 1
-# refused writes in a row until a claim counts as lost although its name still stands: one may be a gateway's answer
+# refused writes in a row until a claim counts as lost although its name is still there: one may be a gateway's answer
 _BUSY_WRITES_MAX = 3
 
 
@@ -29,11 +29,11 @@ class PumpBoard:
     then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 knows no claim and obeys whoever writes.
+    takes commands from nobody else. A board of map version 1 has no claim and obeys every program.
 
     The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is `tcp://HOST:PORT` (502 when left
-    out) or `rtu:///dev/ttyUSB0?baud=115200`; a `link` that is there already takes its place. Raises ValueError (the
-    URL is none, or the board cannot have this watchdog period).
+    out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link` replaces it. Raises ValueError (an invalid URL, or a
+    watchdog period that the board cannot have).
     """
 
     def __init__(
@@ -46,13 +46,13 @@ class PumpBoard:
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
-        self._registers = register_map.default_map()  # of the board that answers, once it has said its version
+        self._registers = register_map.default_map()  # of the board that answers, once its version is known
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
                 f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. {period.maximum:g} s"
             )
-        self._watchdog_s = period.to_value(period.to_raw(watchdog_s))  # as the board will say it back
+        self._watchdog_s = period.to_value(period.to_raw(watchdog_s))  # as the board will read it back
         # The same for every opening by this object, so that a claim whose answer was lost can be repeated. The name
         # is public, the key is secret.
         self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
@@ -129,7 +129,7 @@ class PumpBoard:
                 f"armed {settings['watchdog_arm']:g}, claim {int(sensors.get('claim_in_force', 0)):#x}; "
                 "not safe to run"
             )
-        # go on from the heartbeat that the board was fed last: the first write has to differ from it
+        # continue from the heartbeat that last fed the board: the first write must differ from it
         self._heartbeat = int(sensors["heartbeat_echo"])
         self._armed, self._busy_writes = True, 0
 
@@ -178,10 +178,10 @@ class PumpBoard:
         return roles.FOREIGN_CLAIM * taken | roles.FOREIGN_PERIOD * (sensors["period_in_force_s"] != self._watchdog_s)
 
     async def write(self, command: roles.BenchCommand) -> None:
-        """Write pump and vent with a new heartbeat, in one transaction: what feeds the watchdog.
+        """Write pump and vent with a new heartbeat, in one transaction, which feeds the watchdog.
 
         Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError (no valid answer:
-        the board may or may not have it), DeviceBusyError (the board is another program's by now).
+        the board may or may not have it), DeviceBusyError (another program has the board by now).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
@@ -208,7 +208,7 @@ class PumpBoard:
         """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is. Raises LinkError.
 
         A board of map version 2 latches it as a fault. One of version 1 gets pump 0 without a heartbeat, which
-        neither feeds nor arms its watchdog: whoever holds it may run the pump again with his next command.
+        neither feeds nor arms its watchdog: its holder may run the pump again with the next command.
         """
         if self._registers.map_version == 1:
             await self._link.write_register(self._registers.register("pump_command_fraction").address, 0)

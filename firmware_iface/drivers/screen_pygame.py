@@ -1,10 +1,10 @@
 """A display through pygame-ce (SDL): role Screen.
 
-Source: pygame-ce documentation, `pygame.display`. Patterns are rendered once, when the screen is opened. SDL hands
-out another size than the one asked for without a word, so every size that there is gets compared.
+Source: pygame-ce documentation, `pygame.display`. Patterns are rendered once, when the screen is opened. SDL silently
+gives another size than the requested one, so every size is compared.
 
-`flip` returns when the picture is queued, not when it is lit: `show` waits the settle time, which is to be measured
-(`firmware_iface.display`).
+`flip` returns when the picture is queued, not when it is lit: `show` waits for the settle time, which
+`firmware_iface.display` measures.
 """
 
 import importlib
@@ -29,7 +29,7 @@ class ScreenSettings:
     raster: ScreenRaster  # its pixels and the pattern region
     patterns: Sequence[Pattern]  # what will be shown
     display: int = 0  # from 0
-    settle_s: float = 0.3  # from the command to the light; until it is measured
+    settle_s: float = 0.3  # from the command to the light; until measured
 
     @property
     def name(self) -> str:
@@ -142,7 +142,7 @@ class PygameScreen:
     def _flip(self, surface: Any) -> None:
         pygame = self._pygame
         try:
-            pygame.event.pump()  # a window that answers nobody is greyed out by the desktop
+            pygame.event.pump()  # the desktop greys out a window that answers no events
             self._window.blit(surface, (0, 0))
             pygame.display.flip()
         except pygame.error as error:

@@ -3,9 +3,9 @@
 Manual: PTB330 user's guide M210855EN; FORM and its modifiers pages 70-72, UNIT, ECHO page 83, `?` and ERRS pages
 87-88. Its factory setting is 4800 7E1.
 
-Each message is made to carry pressure, unit, the modules' error flags, the running counter of measurements (a frozen
-value is seen), the serial number (another instrument is seen) and a checksum (sum of all bytes before it modulo
-65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
+Each message is configured to carry pressure, unit, the modules' error flags, the running counter of measurements
+(which reveals a frozen value), the serial number (which reveals another instrument) and a checksum (sum of all bytes
+before it modulo 65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ PA_PER_HPA = 100.0
 RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
 _MESSAGE = re.compile(r"(( *\d{3,4}\.\d{3}|\*+) hPa ([01]{1,3}) * *(\d+) +(\w+) )([0-9A-F]{4})\r\n")
 _IDENTITY = re.compile(r".*?(PTB330) / (\S+).*?Serial number\s*: *(\S+).*?Module 4\s*:[^\r\n]*\r\n", re.DOTALL)
-# the echo may still be on when it is asked first
+# the echo may still be on at the first question
 _VERSION = re.compile(r"(?:.*\r\n)?>? *\S+ / \S+ *\r\n>?", re.DOTALL)
 _UNIT = re.compile(r"P\s*: hPa *\r\n(?:[^\r\n]*\r\n)*")  # other quantities follow
 _OK = re.compile(r"(?:OK|Output format\s*:[^\r\n]*)\s*\r\n")
@@ -61,7 +61,7 @@ class VaisalaPtb330(exchange.LineDriver):
         """Open the port, stop its own output, check its identity, set unit and format, start to poll.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, or a
-        format that is not taken).
+        format that it does not take).
         """
         await self.close()
         self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
@@ -103,7 +103,7 @@ class VaisalaPtb330(exchange.LineDriver):
         await self._link.query("UNIT P hPa", _UNIT, 600)
         await self._link.query(f"FORM {FORMAT}", _OK, 200)
         found = (await self._link.query("FORM ?", _FORM, 200))[1]
-        # it is shown with backslashes for what was given as hash signs
+        # it is shown with backslashes in place of hash signs
         if found.replace("\\", "#").casefold().split() != FORMAT.casefold().split():
             raise roles.DeviceRefusedError(f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}")
 
@@ -116,7 +116,7 @@ class VaisalaPtb330(exchange.LineDriver):
                 self._down = error
                 return
             except roles.LinkError:
-                pass  # the age of the newest value says so
+                pass  # the age of the newest value shows it
 
     async def _refresh(self) -> None:
         answer = await self._link.query("SEND", _MESSAGE)

@@ -3,8 +3,8 @@
 Source: Technical Note TN003, Communications Guide (registers), and the vendor's python-control-Development-Kit.
 `#W<register>,<value>` LF writes and is not answered, `#R<register>` LF is answered `#R<register>,<value>`.
 
-The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it is enabled at what
-its analogue input says, until it is told otherwise. Where gas must stop by itself, something else has to see to it.
+The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it follows its
+analogue input until a host commands it. Where gas must stop by itself, another device must stop it.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ ENABLE, POWER_LIMIT_MW, STREAM, MODE, MANUAL_SOURCE, SET_VALUE, ERROR = 0, 1, 2,
 FIRMWARE, DEVICE_TYPE, FIRMWARE_MINOR = 36, 37, 38
 DEVICE_TYPES = {2: "general purpose driver", 3: "smart pump module"}
 _MODE_MANUAL, _SOURCE_SET_VALUE, _OFF, _ON = 0, 0, 0, 1
-# what a hit write could change unseen, or a power cycle: read back with every command
+# what a corrupted write or a power cycle could change unseen: read back with every command
 _KEPT = (POWER_LIMIT_MW, MODE, MANUAL_SOURCE)
 _STATE = (ENABLE, SET_VALUE, ERROR, *_KEPT)
 _NUMBER = r"-?\d+(?:\.\d+)?"
@@ -42,7 +42,7 @@ class Ventus(exchange.LineDriver):
         """Open the port, stop the pump, check its identity, apply the settings and read them back.
 
         Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
-        setting that is not taken).
+        setting that it does not take).
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
@@ -74,7 +74,7 @@ class Ventus(exchange.LineDriver):
         """Command the pump and read it back.
 
         Raises ValueError (not within 0..1; nothing is sent), LinkError (no valid answer: the pump may or may not have
-        it), LinkDownError (the port is gone, or the pump does not have what was written: open it again).
+        it), LinkDownError (the port is gone, or the pump has another value than written: open it again).
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
@@ -83,15 +83,15 @@ class Ventus(exchange.LineDriver):
         await self._check(await self._write_and_read(writes, *_STATE))
 
     async def pump_fraction(self) -> float:
-        """Read back what the pump is set to.
+        """Read back the pump's setting.
 
         Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is gone, or the pump
-        is set to something that it was not told: open it again).
+        has a setting that nobody commanded: open it again).
         """
         return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 
     async def _check(self, state: dict[int, float]) -> float:
-        """Power in mW, when all is as commanded; asked once more before anything else is believed."""
+        """Power in mW if all is as commanded; asked once more before a difference is accepted."""
         if not self._as_commanded(state):
             state = await self._write_and_read({}, *_STATE)
         if not self._as_commanded(state):
@@ -114,7 +114,7 @@ class Ventus(exchange.LineDriver):
         )
 
     async def _write_and_read(self, writes: dict[int, float], *registers: int) -> dict[int, float]:
-        """Writes and reads in one go: a write has no answer of its own."""
+        """Write and read in one exchange: a write has no answer of its own."""
         lines = [f"#W{register},{_text(register, value)}" for register, value in writes.items()]
         lines += [f"#R{register}" for register in registers]
         answer = await self._link.query("\n".join(lines), _registers(*registers), 24 * len(registers))
@@ -123,7 +123,7 @@ class Ventus(exchange.LineDriver):
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
         if self._link.port.is_open:
-            with contextlib.suppress(roles.LinkError):  # out of reach: what then stops the gas is not this program
+            with contextlib.suppress(roles.LinkError):  # out of reach: this program can no longer stop the gas
                 await self.set_pump(0.0)
         await self._link.close()
 

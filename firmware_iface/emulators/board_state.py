@@ -11,7 +11,7 @@ FIRMWARE_VERSION = 0x00_01_00_00  # 1.0.0
 GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
-_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # what reads as 0
+_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # registers that read as 0
 # the register of a block that carries the claim's secret; a block without one needs no claim
 _KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
 
@@ -33,15 +33,15 @@ class BoardSample:
 class BoardState:
     """The board between two requests, of the map version of `registers`; it reports `map_version`.
 
-    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend on
-    the time passed in and on nothing else.
+    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend
+    only on the time passed in.
     """
 
     def __init__(self, registers: RegisterMap, sample: BoardSample) -> None:
         self.map_version = registers.map_version
         self.registers = registers
         self._by_address = {register.address: register for register in registers}
-        # what drivers ask for is whole blocks, over and over: found at once
+        # drivers read whole blocks again and again: found at once
         self._by_span = {(block.address, block.count): block for block in registers.blocks}
         self._command = registers.block("command")
         self._claims = registers.map_version >= 2
@@ -53,7 +53,7 @@ class BoardState:
         self.restart()
 
     def restart(self) -> None:
-        """Power-up: outputs off, watchdog off, settings lost, faults forgotten."""
+        """Power-up: outputs off, watchdog off, settings and faults lost."""
         self._settable = {
             "watchdog_period_s": WATCHDOG_PERIOD_S,
             "watchdog_arm": 0.0,
@@ -94,7 +94,7 @@ class BoardState:
     def held(self) -> bool:
         """A claim is held and its watchdog was fed in time: no other program may have the board.
 
-        Not by the latched fault: who claims a board that is latched holds it as well.
+        A latched fault does not matter: a program may claim and hold a latched board.
         """
         return bool(self._claim_key) and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
 

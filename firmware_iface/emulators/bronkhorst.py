@@ -19,8 +19,8 @@ _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 class Instrument:
     """The instrument behind its interfaces: "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
 
-    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives what its sensor sees, in `unit`; without
-    it a flow controller sees its own setpoint. `actuate` is given the fraction 0..1 that flows, whenever it changes.
+    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives the sensor's value in `unit`; without it a
+    flow controller measures its own setpoint. `actuate` gets the flowing fraction 0..1 whenever it changes.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Instrument:
 
     @property
     def fraction(self) -> float:
-        """What flows, of the capacity."""
+        """Present flow over the capacity."""
         return (
             self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE
             if self._settings[bronkhorst.CONTROL_MODE] == bronkhorst.BUS_SETPOINT
@@ -133,7 +133,7 @@ class BronkhorstRegisters:
 
 
 class ProparDevice(serial_device.SerialDevice):
-    """The instrument on a serial line; answers in the form it is asked in, binary or ASCII."""
+    """The instrument on a serial line; answers in the form of the question, binary or ASCII."""
 
     def __init__(self, instrument: Instrument, settings: SerialSettings, node: int = 3) -> None:
         super().__init__(settings)

@@ -8,7 +8,7 @@ _WRITABLE = ("001",)
 
 
 class KeyenceDlRs1aEmulator(LineDevice):
-    """One amplifier that sees the mirror (NaN: it is in error), and others that measure nothing of interest.
+    """One amplifier that measures the mirror (NaN: it is in error), and others that measure nothing of interest.
 
     `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
     """
@@ -76,7 +76,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
 
 
 def _text(value_mm: float) -> str:
-    """Page 11: sign, two digits, three decimals; page 12 for what has no value."""
+    """Page 11: sign, two digits, three decimals; page 12 without a value."""
     if math.isnan(value_mm):
         return "+EE.EEE"
     return f"{max(-99.999, min(99.999, value_mm)):+07.3f}"

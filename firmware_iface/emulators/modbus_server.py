@@ -1,7 +1,7 @@
 """A small Modbus TCP server for emulators, which can also answer wrongly on purpose.
 
-Written for itself and not on the client's library: two independent implementations check each other, and a library's
-server has no way to be silent, late or short. Source: Modbus application protocol 1.1b3 and messaging guide 1.0b.
+It does not use the client's library: two independent implementations check each other, and a library's server cannot
+be silent, late or short. Source: Modbus application protocol 1.1b3 and messaging guide 1.0b.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ class RegisterRefusal(Exception):  # noqa: N818 - an answer of the protocol, not
 
 
 class RegisterTable(Protocol):
-    """What function codes work on."""
+    """The registers that function codes read and write."""
 
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
@@ -69,7 +69,7 @@ def _respond(function_code: int, data: bytes, table: RegisterTable) -> bytes:
     if function_code == READ_WRITE:
         read_address, read_count = struct.unpack_from(">HH", data)
         address, words = _words_written(data[4:], _READ_WRITE_MAX)
-        _words_read(table, read_address, read_count)  # refused as a whole: nothing is written if the read is wrong
+        _words_read(table, read_address, read_count)  # refused as a whole: a wrong read writes nothing
         table.write(address, words)
         return _words_read(table, read_address, read_count)
     raise RegisterRefusal(ILLEGAL_FUNCTION)
@@ -90,7 +90,7 @@ def _words_written(data: bytes, most: int) -> tuple[int, list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What goes back for a request."""
+    """The answer to a request."""
 
     pdu: bytes = b""  # empty: nothing is sent
     delay_s: float = 0.0  # sent this much later; later requests of the connection are answered meanwhile

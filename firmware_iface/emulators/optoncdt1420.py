@@ -7,7 +7,7 @@ from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 NO_PEAK = 262_076
 _PERIOD_S = 0.0025  # between two portions of the stream, as an adapter hands them over
-# what the sensor has after power-up, unless it was stored otherwise
+# the sensor's settings after power-up, unless others were stored
 _DEFAULTS = {
     "OUTPUT": "ANALOG",
     "MEASRATE": "2",
@@ -27,7 +27,7 @@ _CHOICES = {
 
 
 class Optoncdt1420Emulator(LineDevice):
-    """Sees the mirror from behind, displacement 0 in the middle of its range (NaN: nothing is in sight)."""
+    """Measures the mirror from behind, displacement 0 in the middle of its range (NaN: no target)."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Optoncdt1420Emulator(LineDevice):
         self._owed = 0.0
 
     def restart(self) -> None:
-        """Settings that were not stored are lost: it does not stream."""
+        """Settings that were not stored are lost, so it does not stream."""
         super().restart()
         self._stop()
         self._register = dict(_DEFAULTS)
@@ -104,7 +104,7 @@ class Optoncdt1420Emulator(LineDevice):
             self._stream = None
 
     def _portion(self) -> None:
-        """Send what was measured since the last portion."""
+        """Send the measurements since the last portion."""
         loop = asyncio.get_running_loop()
         self._owed += (loop.time() - self._streamed_s) * 1000 * float(self._register["MEASRATE"])
         self._streamed_s = loop.time()
@@ -119,7 +119,7 @@ class Optoncdt1420Emulator(LineDevice):
         self.say(data)
 
     def digital(self, displacement_um: float) -> int:
-        """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02; page 66 for what has no value."""
+        """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02; page 66 without a value."""
         if math.isnan(displacement_um):
             return NO_PEAK
         distance_mm = self._range_mm / 2 + self._direction * displacement_um / 1000

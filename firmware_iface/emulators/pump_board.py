@@ -12,7 +12,7 @@ _GATEWAY_NO_RESPONSE = 11
 
 
 class BoardPlant(Protocol):
-    """What hangs on the board's wires."""
+    """The plant on the board's wires."""
 
     def sample(self) -> board_state.BoardSample:
         """The newest sample of the sensors; called every 10 ms and at every request."""
@@ -25,8 +25,7 @@ class PumpBoardEmulator:
     """Serves `plant` on Modbus TCP, from the event loop's thread.
 
     Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default the event loop's.
-    Requests to other units are answered with exception 11, as a gateway does. `registers` may be those of an earlier
-    map version.
+    Requests to other units get exception 11, as from a gateway. `registers` may be those of an earlier map version.
     """
 
     def __init__(

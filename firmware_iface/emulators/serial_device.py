@@ -10,28 +10,28 @@ from pathlib import Path
 
 from firmware_iface.links.serial_port import SerialSettings
 
-Sensor = Callable[[], float]  # what a device measures
-Drive = Callable[[float], None]  # what an actuator's fraction does
+Sensor = Callable[[], float]  # a device's measured value
+Drive = Callable[[float], None]  # takes an actuator's fraction
 Transmit = Callable[[bytes], None]
 
 
 class SerialDevice:
-    """Hears bytes, says bytes. A device overrides `received`, and `restart` if it can lose settings."""
+    """Receives and sends bytes. A device overrides `received`, and `restart` if it can lose settings."""
 
-    frozen = False  # the measured value stays what it was
+    frozen = False  # the measured value does not change
 
     def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
         self._transmit: Transmit | None = None
-        self._free_s = 0.0  # until then the line is taken by what is being said
+        self._free_s = 0.0  # until then the line is busy with sending
         self._due: set[asyncio.TimerHandle] = set()
 
     def attach(self, transmit: Transmit) -> None:
-        """The wire is plugged in: what is said goes to `transmit`."""
+        """The wire is plugged in: sent bytes go to `transmit`."""
         self._transmit = transmit
 
     def detach(self) -> None:
-        """The wire is pulled: whatever was on its way is lost."""
+        """The wire is pulled: bytes on their way are lost."""
         self._transmit = None
         self._free_s = 0.0
         for timer in self._due:
@@ -39,7 +39,7 @@ class SerialDevice:
         self._due.clear()
 
     def power_cycle(self) -> None:
-        """Off and on again: nothing more of what was to be said, settings as after power-up."""
+        """Off and on again: unsent bytes are lost, settings as after power-up."""
         transmit = self._transmit
         self.detach()
         self._transmit = transmit
@@ -49,11 +49,11 @@ class SerialDevice:
         """Settings as after power-up."""
 
     def hear(self, data: bytes) -> None:
-        """Bytes begin to arrive; the device has them when the last one is in."""
+        """Bytes begin to arrive; the device gets them when the last one is in."""
         self._later(asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data)
 
     def received(self, data: bytes) -> None:
-        """Bytes arrived: for the device to answer with `say`."""
+        """Bytes arrived; the device answers with `say`."""
         raise NotImplementedError
 
     def arrived(self, data: bytes) -> None:
@@ -61,7 +61,7 @@ class SerialDevice:
         self.received(data)
 
     def say(self, answer: bytes, delay_s: float = 0.0) -> None:
-        """Send an answer, behind what is being sent."""
+        """Send an answer after the bytes being sent."""
         begin_s = max(asyncio.get_running_loop().time() + delay_s, self._free_s)
         self._free_s = begin_s + len(answer) * self.settings.char_s
         self._later(self._free_s, self._sent, answer)
@@ -80,7 +80,7 @@ class SerialDevice:
 
 
 class LineDevice(SerialDevice):
-    """A device that is asked in lines of text; one overrides `line`."""
+    """A device that answers lines of text; a device overrides `line`."""
 
     end = b"\n"
 
@@ -89,7 +89,7 @@ class LineDevice(SerialDevice):
         self._heard = b""
 
     def received(self, data: bytes) -> None:
-        """Answer every line that is complete."""
+        """Answer every complete line."""
         *lines, self._heard = (self._heard + data).split(self.end)
         for line in lines:
             self.line(line.strip().decode("ascii", "replace"))
@@ -104,15 +104,15 @@ class LineDevice(SerialDevice):
 
 
 _READ_BYTES = 65_536
-_SPEED = 4  # place of the input speed in what tcgetattr gives; the output speed follows
+_SPEED = 4  # index of the input speed in tcgetattr's list; the output speed follows
 
 
 class PtyWire:
     """An emulated device behind a pseudo-terminal, to be opened at `path` like any serial port.
 
     `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens it with another
-    baud rate than the device's gets garbage and is not understood, as on a real line. Character size and parity are
-    no properties of a pseudo-terminal.
+    baud rate than the device's gets garbage and is not understood, as on a real line. A pseudo-terminal has no
+    character size or parity.
     """
 
     def __init__(self, device: SerialDevice, path: Path) -> None:
@@ -123,7 +123,7 @@ class PtyWire:
     def plug(self) -> None:
         """Plug in. Raises OSError, for example when the path is taken."""
         device_end, program_end = os.openpty()
-        self._ends = device_end, program_end  # the second is held open: without one, the first reports a hang-up
+        self._ends = device_end, program_end  # the second is kept open, or the first would report a hang-up
         tty.setraw(program_end)
         line = termios.tcgetattr(program_end)
         line[_SPEED] = line[_SPEED + 1] = _speed(self._device)
@@ -156,7 +156,7 @@ class PtyWire:
                 os.write(self._ends[0], self._seen(data))
 
     def _seen(self, data: bytes) -> bytes:
-        """What the other end makes of the bytes: at another baud rate, garbage."""
+        """The bytes as the other end receives them: at another baud rate, garbage."""
         assert self._ends is not None
         same = termios.tcgetattr(self._ends[0])[_SPEED] == _speed(self._device)
         return data if same else bytes((7 * byte + 0xA5) % 256 for byte in data)

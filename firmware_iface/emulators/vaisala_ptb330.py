@@ -12,7 +12,7 @@ _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class VaisalaPtb330Emulator(LineDevice):
-    """Feels the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its three modules'."""
+    """Measures the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its three modules'."""
 
     end = b"\r"
 

@@ -52,7 +52,7 @@ class VentusEmulator(LineDevice):
         self._act()
 
     def line(self, text: str) -> None:
-        """One command; what is none is ignored."""
+        """One command; anything else is ignored."""
         found = _COMMAND.fullmatch(text)
         if found is None:
             return

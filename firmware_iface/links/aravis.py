@@ -1,7 +1,7 @@
-"""The aravis library through ctypes: GenICam cameras with nothing but the distribution's shared library.
+"""The aravis library through ctypes: GenICam cameras with only the distribution's shared library.
 
-Source: headers of aravis 0.8 (`arvcamera.h`, `arvstream.h`, `arvbuffer.h`, `arvdevice.h`), whose binary interface
-is fixed by the library's version in its name. ctypes gives the interpreter free during every call.
+Source: headers of aravis 0.8 (`arvcamera.h`, `arvstream.h`, `arvbuffer.h`, `arvdevice.h`); the version in the
+library's name fixes the binary interface. ctypes releases the interpreter during every call.
 """
 
 import ctypes
@@ -107,7 +107,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 class AravisError(LinkError):
-    """What the library said, with its code (ArvDeviceError, or NOT_OF_THE_DEVICE)."""
+    """The library's message, with its code (ArvDeviceError, or NOT_OF_THE_DEVICE)."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -143,7 +143,7 @@ class Aravis:
         if error:
             message, code = error.contents.message.decode(errors="replace"), error.contents.code
             if error.contents.domain != self._calls["arv_device_error_quark"]():
-                code = NOT_OF_THE_DEVICE  # the same numbers mean other things there
+                code = NOT_OF_THE_DEVICE  # the same numbers have other meanings there
             self._calls["g_error_free"](error)
             raise AravisError(message, code)
         return result

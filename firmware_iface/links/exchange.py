@@ -21,8 +21,8 @@ from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
-# after this many questions without a valid answer the line is closed: its owner then opens it again, which also
-# applies the settings that a device loses with its power
+# after this many questions without a valid answer the line is closed: its owner then reopens it, which also applies
+# the settings that a device loses with its power
 _FAILURES_MAX = 5
 
 
@@ -33,16 +33,16 @@ class Question:
     data: bytes  # sent unchanged
     # from all bytes so far: the answer, None while incomplete. Raises LinkError for anything else
     take: Callable[[bytes], bytes | None]
-    answer_bytes: int  # length of the longest answer: its time on the wire comes on top of the device's own
+    answer_bytes: int  # length of the longest answer: its time on the wire is added to the device's own
     what: str  # for messages: device and request
 
 
 class SerialExchange:
     """Questions and answers on one line, for one device or several that take turns; its port's only user.
 
-    Devices want the silence `gap_s` between an answer and the next question. After a loss it is `quiet_s`, as long as
-    devices are usually late at most; the fence covers the rest. Bytes of `blank` mean nothing between answers, like
-    the LF behind a CR that already ended one.
+    Devices need the silence `gap_s` between an answer and the next question. After a loss it is `quiet_s`, the usual
+    upper limit of late answers; the fence covers the rest. Bytes of `blank` mean nothing between answers, like the LF
+    after a CR that already ended one.
     """
 
     def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
@@ -64,8 +64,8 @@ class SerialExchange:
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; discard outstanding answers to an earlier user.
 
-        The greeting is sent at once and its answer discarded, for devices that talk unasked until
-        stopped. Raises LinkDownError if the port does not open.
+        The greeting is sent at once and its answer discarded, for devices that send unasked until stopped. Raises
+        LinkDownError if the port does not open.
         """
         self.port.open(self)
         self._sure.clear()
@@ -85,9 +85,9 @@ class SerialExchange:
     async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
         """Ask a question once and return its answer; nothing is ever resent automatically.
 
-        Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`; the time on
-        the wire comes on top. A device that has no fence (None) is protected by `quiet_s` alone. Raises LinkError (no
-        valid answer), LinkDownError (the line is closed or went away).
+        Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`, plus the
+        time on the wire. `quiet_s` alone protects a device that has no fence (None). Raises LinkError (no valid
+        answer), LinkDownError (the line is closed or went away).
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -98,7 +98,7 @@ class SerialExchange:
     def _ended(self, task: asyncio.Task[bytes]) -> None:
         self._turn.release()
         if not task.cancelled():
-            task.exception()  # of a cancelled caller nobody else looks at it
+            task.exception()  # after a cancelled caller nobody else retrieves it
 
     async def _transact(self, question: Question, timeout_s: float, fence: Question | None, key: int) -> bytes:
         try:
@@ -145,7 +145,7 @@ class SerialExchange:
         self._answer = answer
         wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
         try:
-            # not asyncio.timeout: it throws away an answer that has come while this process was kept from running
+            # not asyncio.timeout: it discards an answer that arrived while this process was suspended
             await asyncio.wait([answer], timeout=timeout_s + wire_s)
         finally:
             self._answer = None
@@ -167,7 +167,7 @@ class SerialExchange:
         """Bytes came (called by the port)."""
         self._last_byte_s = asyncio.get_running_loop().time()
         if self._answer is None or self._answer.done() or self._take is None:
-            self._noisy |= bool(data.strip(self._blank))  # nobody asked
+            self._noisy |= bool(data.strip(self._blank))  # unsolicited
             return
         self._heard += data
         try:
@@ -184,7 +184,7 @@ class SerialExchange:
             self._answer.set_exception(error)
 
 
-# One device that is asked in lines of text.
+# One device that answers lines of text.
 
 _SHOWN_CHARS = 60
 _LINE_ENDS = b"\r\n"
@@ -200,9 +200,9 @@ class LineFence:
 
 
 class LineLink:
-    """Commands out, lines of text back, each checked as a whole against what it has to look like.
+    """Commands out, lines of text back, each checked as a whole against its expected form.
 
-    A command ends in `end`. The device has `timeout_s`; the time on the wire comes on top.
+    A command ends in `end`. The device has `timeout_s`, plus the time on the wire.
     """
 
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
@@ -228,14 +228,14 @@ class LineLink:
     async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
         """The answer to a command (without its end), whose whole text has the given form, line ends included.
 
-        The pattern has to match everything that comes, line ends before it aside, and nothing that is still
-        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of this form in time),
-        LinkDownError (the line is gone).
+        The pattern must match all that comes, except line ends before it, and nothing that is still incomplete; more
+        than `longest` characters are no answer. Raises LinkError (no answer of this form in time), LinkDownError (the
+        line is gone).
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
         heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)
         found = answer.fullmatch(heard.decode("ascii"))
-        assert found is not None  # `take` has matched it
+        assert found is not None  # `take` matched it
         return found
 
     def _question(self, command: str, answer: re.Pattern[str], longest: int) -> Question:
@@ -257,7 +257,7 @@ class LineLink:
 
 
 class LineDriver:
-    """Base of a driver whose device is asked in lines of text on a serial port of its own."""
+    """Base of a driver for a device that answers lines of text on its own serial port."""
 
     manual = ""
 
@@ -294,8 +294,8 @@ class LineDriver:
 class StepGate:
     """Passes a value within `step` of either of the last two, passed or not.
 
-    A hit reading is alone and is stopped; the good one after it still has the good one before. A true step is stopped
-    once and passes with its second reading. The first value of all has nothing to confirm it and is stopped.
+    A corrupted reading stands alone and is stopped; the good one after it still has the good one before. A true step
+    is stopped once and passes with its second reading. Nothing confirms the very first value, so it is stopped.
     """
 
     def __init__(self, step: float) -> None:

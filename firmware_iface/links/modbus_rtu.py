@@ -92,7 +92,7 @@ class RtuBus:
 
 
 class GuardedModbusRtu:
-    """One Modbus RTU device of a bus: the first to connect opens the bus, any one closes it for all.
+    """One Modbus RTU device of a bus: the first to connect opens the bus, any of them closes it for all.
 
     The device has `timeout_s`, plus the time on the wire. `fence` is False for a device that ignores function 8
     instead of refusing it.
@@ -191,7 +191,7 @@ class ModbusLinks:
     def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_tcp.ModbusLink:
         """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
 
-        `fence`: see `links.exchange`; of no meaning for TCP. Raises ValueError for a URL that is neither.
+        `fence`: see `links.exchange`; TCP does not use it. Raises ValueError for a URL that is neither.
         """
         if not url.startswith("rtu:"):
             host, port = parse_tcp_url(url)

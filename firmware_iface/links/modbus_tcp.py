@@ -1,8 +1,8 @@
 """Modbus TCP with checks and prompt errors that the library's client lacks.
 
-It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction
-id 0 is accepted; a connection lost in mid-request waits for the full timeout; a retry sends a write again; a server
-that accepts and hangs up is called ten times a second.
+It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction id 0 is
+accepted; a connection lost in mid-request waits for the full timeout; a retry repeats a write; a server that accepts
+and hangs up is called ten times a second.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ class ModbusLink(Protocol):
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is up."""
 
     async def connect(self) -> None:
         """Connect anew."""
@@ -72,7 +72,7 @@ def exception_error(what: str, code: int) -> LinkError:
     return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
 
 
-# the library also logs what is raised here; without a handler it would write to the console
+# the library also logs what it raises; without a handler that would go to the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 # a peer that lost its power does not close the connection: after this many unanswered requests in a row, and one more
@@ -105,7 +105,7 @@ class GuardedModbusTcp:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands."""
+        """Whether the connection is up."""
         return self._client is not None and self._client.connected
 
     @property

@@ -1,7 +1,7 @@
 """A serial port on the event loop: delivers bytes as they arrive, and reports a lost link at once.
 
-Through `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug makes the descriptor
-readable at once. pyserial opens and configures the port, nothing more.
+It uses `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug makes the descriptor
+readable at once. pyserial only opens and configures the port.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkE
 # Waits between failed attempts to connect to a device.
 
 
-# quick enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
+# fast enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
 FIRST_S = 0.1
 LONGEST_S = 5.0
 
@@ -73,7 +73,7 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """Of the line: `parity` is "N", "E" or "O"; with E or O, bytes of wrong parity are dropped by the kernel."""
+    """Line settings: `parity` is "N", "E" or "O"; with E or O, the kernel drops bytes of wrong parity."""
 
     baud: int
     data_bits: int = 8
@@ -128,7 +128,7 @@ class SerialPort:
 
     @property
     def settings(self) -> SerialSettings:
-        """Of the line."""
+        """Line settings."""
         return self._settings
 
     @property
@@ -185,7 +185,7 @@ class SerialPort:
         port, self._serial, self._receiver = self._serial, None, None
         asyncio.get_running_loop().remove_reader(port.fileno())
         with contextlib.suppress(OSError, termios.error):
-            # closing a tty waits for its output to drain, up to 30 s when the line is held
+            # closing a tty waits up to 30 s for its output to drain when the line is held
             termios.tcflush(port.fileno(), termios.TCOFLUSH)
         with contextlib.suppress(OSError):
             port.close()
@@ -212,7 +212,7 @@ class SerialPort:
             data = b""
         if data:
             self._receiver.received(data)
-        else:  # the end of a tty is a hang-up
+        else:  # end of file on a tty is a hang-up
             self._gone()
 
     def _gone(self) -> LinkDownError:
@@ -242,7 +242,7 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
             raise DeviceRefusedError(f"{name}: {remedy}") from error
         raise LinkDownError(f"{name}: {remedy}") from error
     with contextlib.suppress(ValueError, OSError):
-        port.set_low_latency_mode(True)  # FTDI adapters otherwise hold bytes back for 16 ms; others do not have it
+        port.set_low_latency_mode(True)  # FTDI adapters otherwise hold bytes back for 16 ms; others lack this mode
     if settings.parity != "N":
         _drop_wrong_parity(port.fileno())
     return port
@@ -264,7 +264,7 @@ def _drop_wrong_parity(descriptor: int) -> None:
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
 
-# Serial ports by identity (USB) instead of by socket.
+# Serial ports by USB identity instead of by socket.
 
 _USB_NAME = re.compile(r"usb:([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?::(.+))?")
 
@@ -295,7 +295,7 @@ def check_port_name(name: str) -> str:
 def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
     """Present path of the port with this name.
 
-    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters answer to the name).
+    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters have the name).
     """
     wanted = _USB_NAME.fullmatch(name)
     if wanted is None:

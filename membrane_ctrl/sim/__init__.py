@@ -1,1 +1,1 @@
-"""The twin: film, gas, pump, sensors and optics, simulated without the code of the inverse."""
+"""The twin: film, gas, pump, sensors and optics, simulated without the code of the reconstruction."""

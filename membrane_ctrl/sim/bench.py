@@ -31,12 +31,12 @@ class BenchSpec:
 
     twin: TwinConfig
     pump: PumpConfig
-    clock: RunClock  # the run's clock, on which the truth is stamped
+    clock: RunClock  # the run's clock, which stamps the truth
     port: int  # where to listen; 0: any free port
     host: str = "127.0.0.1"
     speed: float = 1.0  # plant seconds a second
     truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
-    # how long the bench outlives the process that started it, so that the tripped watchdog can be seen
+    # how long the bench outlives the process that started it, so that the tripped watchdog can be observed
     linger_s: float = 5.0
     events: tuple[BenchEvent, ...] = ()  # events in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
@@ -44,7 +44,7 @@ class BenchSpec:
 
 @dataclass(frozen=True, slots=True)
 class BenchReport:
-    """The first report of a bench process: the devices it serves, or why it does not."""
+    """The first report of a bench process: the devices it serves, or why it serves none."""
 
     port: int = 0
     error: str = ""
@@ -59,7 +59,7 @@ def serve(spec: BenchSpec, ready: Connection) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
-        raise_priority()  # it represents devices with their own processors; at higher speeds it may use up a core
+        raise_priority()  # it stands for devices with their own processors; at higher speeds it may use a whole core
     asyncio.run(_serve(spec, ready))
 
 
@@ -102,7 +102,7 @@ async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event
             orphaned_s = now_s
         if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
             return
-        deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline is not made up: catch_up has done it
+        deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline needs no extra round: catch_up covers it
         await asyncio.sleep(deadline_s - now_s)
 
 
@@ -140,7 +140,7 @@ class LiveBench:
     def catch_up(self) -> None:
         """Advance the plant to the clock, after a long stall in several calls.
 
-        Of several due samples a client could see only the last; the counter counts all.
+        Of several samples due, a client could see only the last; the counter counts all.
         """
         due_s = (self._now() - self._start_s) * self._speed - self._plant.time_s
         steps = min(int(due_s / STEP_S), _STEPS_AT_ONCE)

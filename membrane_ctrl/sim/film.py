@@ -20,8 +20,8 @@ from membrane_ctrl.model.arrays import FloatArray
 #
 #     n'' + 3 n'/rho + 1/(8 n^2) = 0,   n'(0) = 0,   n'(1) + (1 - nu) n(1) = 0,   dW/drho = q^(1/3) rho / (2 n).
 #
-# With n = sum_k b_k u^k and g = 1/n the equation reads 4 k (k + 1) b_k = -(g^2)_(k-1) / 8, so that all b_k follow
-# from b_0, which the rim's condition fixes. The terms fall by about 0.3 each: 40 of them reach the last bit.
+# With n = sum_k b_k u^k and g = 1/n the equation becomes 4 k (k + 1) b_k = -(g^2)_(k-1) / 8, so all b_k follow from
+# b_0, which the rim's condition fixes. The terms fall by about 0.3 each: 40 of them reach the last bit.
 
 _TERMS = 40
 POISSON_PET = 0.3
@@ -124,7 +124,7 @@ GAS_FOLLOWS_AIR_S = 12.0  # through 10 um of PET (docs/physics.md, estimate)
 class Gas:
     """State of the gas."""
 
-    amount_ml: float  # gas between the films; flat films hold none
+    amount_ml: float  # gas between the films; flat films contain none
     temperature_k: float
     root_pa: float  # cube root of the gauge pressure
 
@@ -140,8 +140,8 @@ class Gas:
         side is convex and almost linear in u (u^3 is 0.6 % of ambient), so that one Newton step from the last u is
         exact to 1e-11 in the twin's small steps; the next step removes the error of a sudden jump.
 
-        `added_ml` is reference mL in minus out, `follow` the share of the difference to the air temperature that is
-        made up in this step, `volume` the c of both films in m^3 per Pa^(1/3).
+        `added_ml` is reference mL in minus out, `follow` the share of the difference to the air temperature that this
+        step closes, `volume` the c of both films in m^3 per Pa^(1/3).
         """
         amount_ml = self.amount_ml + added_ml
         self.amount_ml = amount_ml if amount_ml > 0.0 else 0.0  # a third of the time of max()
@@ -159,7 +159,7 @@ class Gas:
 
 
 def filled(gauge_pressure_pa: float, temperature_k: float, ambient_pa: float, volume: float) -> Gas:
-    """The gas that stands at a gauge pressure between films of `volume` m^3 per Pa^(1/3)."""
+    """Gas at a gauge pressure between films of `volume` m^3 per Pa^(1/3)."""
     root_pa = gauge_pressure_pa ** (1 / 3)
     pv = (ambient_pa + gauge_pressure_pa) * volume * root_pa
     return Gas(pv / (JOULE_PER_ML * temperature_k / REFERENCE_K), temperature_k, root_pa)

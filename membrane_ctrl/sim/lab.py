@@ -206,7 +206,7 @@ class MapDevice:
         self.restart()
 
     def restart(self) -> None:
-        """Power up: every output at the raw value 0, with its effect on the plant, if any."""
+        """Power-up: every output at the raw value 0, with its effect on the plant, if any."""
         self._written = {found.address + n: 0 for found in self._outputs for n in range(found.words)}
         for found, tell in self._outputs.items():
             self._tell(found, tell)

@@ -25,7 +25,7 @@ class Truth:
     gas_temperature_c: float
     laser_bias_um: float  # error of the laser due to its mount
     laser_lost: float  # 1 while the laser receives no light
-    leak_um_per_s: float  # speed at which the leak alone lets the centre down
+    leak_um_per_s: float  # speed at which the leak alone lowers the centre
     pump_um_per_s: float  # speed at which the pump's flow lifts it
     vent_um_per_s: float
 

@@ -16,7 +16,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 ShapeSource = Callable[[float], ShapeEstimate | None]
 # Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 um (docs/control.md).
 SAG_SIGMA_UM = 0.01
-EXPOSURES_S = 0.9  # first to last frame of that cycle: over it the laser's readings are averaged
+EXPOSURES_S = 0.9  # first to last frame of that cycle, over which the laser's readings are averaged
 
 
 class TruthShape:

@@ -36,9 +36,9 @@ class Wrong:
     silent: bool = False  # requests are carried out and not answered
     unreachable: bool = False  # there is no connection
     lost_every: int = 0  # every n-th request gets no answer; 0: none is lost
-    readback_fraction: float = math.nan  # what the pump says of itself, whatever it is given
+    readback_fraction: float = math.nan  # the pump's read-back, whatever its command
     pump_share: float = 1.0  # how much of its flow the pump still gives
-    pump_stuck_fraction: float = math.nan  # where it stays, whatever the board wants
+    pump_stuck_fraction: float = math.nan  # where it stays, whatever the board commands
     vent_stuck_fraction: float = math.nan
     stalled: bool = False  # the control process does not run: stopped, hung, or starved
     late_ms: float = 0.0  # every tick starts so late
@@ -50,7 +50,7 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    `wrong` are its switches, `truth` is what really was when the board last took its sample, or would have.
+    `wrong` are its switches, `truth` is the true state when the board last took its sample, or would have.
     """
 
     def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:
@@ -68,7 +68,7 @@ class VirtualBench:
         self.drive()
 
     def drive(self) -> None:
-        """Give the actuators what the board wants, as far as they follow."""
+        """Drive the actuators as the board commands, as far as they follow."""
         wrong = self.wrong
         pump, vent = self.board.pump_fraction * wrong.pump_share, self.board.vent_fraction
         self.plant.actuate(
@@ -88,7 +88,7 @@ class VirtualBench:
         return ""
 
     def power_cycle(self) -> None:
-        """The board restarts: outputs off, watchdog off, faults forgotten."""
+        """The board restarts: outputs off, watchdog off, faults lost."""
         self.board.restart()
         self.drive()
 
@@ -108,7 +108,7 @@ class VirtualBench:
         at_once(self._driver.write(command))
 
     def clear_faults(self, mask: int) -> None:
-        """Clear these bits of what the board has latched. Raises LinkError."""
+        """Clear these bits of the board's latched faults. Raises LinkError."""
         at_once(self._driver.clear_faults(mask))
 
     def close(self) -> None:
@@ -189,7 +189,7 @@ class _MemoryLink:
 
 @contextlib.contextmanager
 def _refusals(name: str) -> Iterator[None]:
-    """What the board refuses, as a link says it."""
+    """A refusal of the board, as the link's error."""
     try:
         yield
     except modbus_server.RegisterRefusal as refusal:

@@ -2,8 +2,8 @@
 
 `[geometry]` is what every command reads. `[covariance]` is what a Monte Carlo draws from: shifts and turns of camera
 and screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of everything
-about z, has no variance: it defines x). `[parameters]` are the calibration's own, `[calibration]` says where all
-that comes from. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
+about z, has no variance: it defines x). `[parameters]` are the calibration's own, `[calibration]` states the origin
+of all that. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
 screen's pitch were calibrated; a measurement with such a file needs them too.
 """
 
@@ -26,16 +26,16 @@ _LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1",
 
 @dataclass(frozen=True)
 class Origin:
-    """What `[calibration]` says of where a geometry comes from."""
+    """Origin of a geometry, as `[calibration]` states it."""
 
     date_utc: str
     sets: tuple[str, ...]
     screen_residual_um: float  # median over the sets of the RMS of seen minus predicted screen points
-    # Median over the sets of the RMS that `measure` states with this geometry: what a drift is seen against
+    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a drift
     slope_residual_urad: float
-    slope_noise_urad: float  # what the camera's noise is in it
+    slope_noise_urad: float  # share of the camera's noise in it
     condition: float  # see `propagate.condition_number`
-    notes: tuple[str, ...] = ()  # what was found on the way
+    notes: tuple[str, ...] = ()  # findings of the calibration
 
 
 def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:

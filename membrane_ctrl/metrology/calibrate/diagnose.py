@@ -1,8 +1,8 @@
 """Is the model right, and do the sets belong together? All of it from the equations at the solution.
 
-What is asked is always the same: by how much does the sum of squares fall if something more is free? The fall is a
-chi-square of as many degrees of freedom if the data are good, whatever is asked. A parameter that was held (a bent
-screen, a lens that distorts), a camera that stands otherwise for some of the sets, one set that disagrees with all.
+Every test is the same: by how much does the sum of squares fall if more is free? With good data the fall is a
+chi-square with as many degrees of freedom. Freed in turn: a parameter that was held (a bent screen, a lens that
+distorts), the camera's pose for some of the sets, everything for one set.
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
 _CAMERA = tuple(parameters.NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
-_CAMERA_SIGMA_DEG = 1.0  # of a bump: what a hand on the mount does
-_LASER_SIGMA = 1.0  # of its scale when the optics alone shall say it
+_CAMERA_SIGMA_DEG = 1.0  # of a bump: a hand on the mount
+_LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
 
 
 @dataclass(frozen=True)
@@ -25,20 +25,20 @@ class Suspect:
     """A held parameter that the sets want to move."""
 
     name: str
-    value: float  # what it would be if it were free
+    value: float  # its value if it were free
     sigma: float
     fall: float  # of the sum of squares
-    figure_um: float  # what freeing it does to a surface, RMS without the best plane
+    figure_um: float  # effect of freeing it on a surface, RMS without the best plane
 
     @property
     def sure(self) -> bool:
-        """Whether noise would hardly ever ask for as much."""
+        """Whether noise hardly ever causes as large a fall."""
         return bool(chi2.sf(self.fall, 1) < SURE)
 
 
 @dataclass(frozen=True)
 class LaserScale:
-    """Scale of the laser and its sigma as the optics alone see it (1: good); the fall is against the prior."""
+    """Scale of the laser and its sigma by the optics alone (1: good); the fall is against the prior."""
 
     value: float
     sigma: float
@@ -52,7 +52,7 @@ class LaserScale:
 
 @dataclass(frozen=True)
 class CameraBump:
-    """The camera stands otherwise for some of the sets."""
+    """The camera's pose differs for some of the sets."""
 
     sets: tuple[int, ...]
     turned_deg: tuple[float, float, float]
@@ -79,7 +79,7 @@ class LeftOut:
 
 
 def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
-    """Held optical parameters that would take more than noise out of the residuals, the strongest first."""
+    """Held optical parameters that would remove more than noise from the residuals, the strongest first."""
     sums = np.sum(_reduced(solution), axis=0)
     response = propagate.surface_response(solution, len(solution.states) // 2)[:, :-1]
     flat = propagate.without_plane(*propagate.disc(1.0))
@@ -99,7 +99,7 @@ def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
 
 
 def laser_scale(solution: solve.Solution) -> LaserScale:
-    """The laser's scale, nothing known of it beforehand."""
+    """The laser's scale without a prior."""
     k = parameters.NAMES.index(parameters.LASER.name)
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
@@ -124,7 +124,7 @@ def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
 
 
 def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
-    """The camera turned for one set, or from one set on; those that are sure, the strongest first."""
+    """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
     count = len(reduced)
     before = _squares(np.sum(reduced, axis=0), sigmas, solution.common)
@@ -144,7 +144,7 @@ def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
 
 
 def without(solution: solve.Solution, index: int) -> solve.Solution:
-    """The same to first order without one set: its equations and state are left out, the unknowns moved."""
+    """The solution without one set, to first order: its equations and state are left out, the unknowns moved."""
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)

@@ -1,11 +1,11 @@
-"""When to calibrate again: what the fit leaves now, against what it left when the geometry was calibrated.
+"""When to calibrate again: the fit's residual now, against its residual when the geometry was calibrated.
 
-A geometry that has become wrong bends the fringes in a way that no surface can explain: the slopes' residual grows.
-A live cycle bins otherwise than the sets of a calibration and sees other light, so that the camera's noise is taken
-out of the one residual and put into the other: what is compared is the film and the geometry.
+A geometry that has become wrong bends the fringes in a way that no surface can explain: the slopes' residual grows. A
+live cycle has other bins and other light than the sets of a calibration, so the camera's noise is subtracted from the
+one residual and added to the other: only film and geometry are compared.
 
-Some errors are no surface's (a camera that rolls), others are (a camera that turns: the surface tilts and bends with
-it). Those are seen by the ring, which cannot have tilted.
+No surface can explain some errors (a camera that rolls). It can explain others (a camera that turns: the surface
+tilts and bends with it); the ring, which cannot have tilted, shows those.
 
 One bad cycle is no drift (a door, a hand before the screen); the median of many is.
 """
@@ -22,9 +22,9 @@ from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
 CYCLES = 60  # two minutes of cycles
-GROWN = 1.25  # times what is expected: 0.75 of it more, added in squares
-FINE = 1.1  # times what is expected: a warning ends here
-# What is asked of a figure. A camera that turned by 0.02 degrees moves the ring by 5.6 um and bends the figure by 4
+GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
+FINE = 1.1  # times the expected residual: a warning ends here
+# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 um and bends the figure by 4
 RING_MOVED_UM = 5.0
 RING_BACK_UM = 3.0
 
@@ -37,9 +37,9 @@ def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> 
 
 @dataclass
 class DriftMonitor:
-    """Watches the live residual.
+    """Monitors the live residual.
 
-    What it is given are `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
+    Its arguments are `slope_residual_urad` and `slope_noise_urad` of the geometry's `[calibration]`.
     """
 
     calibrated_urad: float
@@ -66,13 +66,13 @@ class DriftMonitor:
 
 
 def ring_um(surface: Surface) -> FloatArray:
-    """Harmonics (14,) of the rim's height but its mean: cosines 1 to 7, then sines."""
+    """Harmonics (14,) of the rim's height without its mean: cosines 1 to 7, then sines."""
     return np.asarray(1e3 * (rim_harmonics() @ surface.parameters)[1:])
 
 
 @dataclass
 class RingMonitor:
-    """Watches where the live cycles see the ring, which stays where it is.
+    """Monitors the ring's position in the live cycles; the true ring does not move.
 
     Parameters
     ----------

@@ -33,13 +33,13 @@ class BoardView:
 
 @dataclass(frozen=True)
 class Lens:
-    """What the views say."""
+    """Result of the views."""
 
     focal_px: float
     principal_px: tuple[float, float]
     distortion: tuple[float, ...]  # k1, k2, p1, p2
     sigmas: dict[str, float]  # by the calibration's names of the parameters
-    rms_px: float  # what is left of a corner (both components), with this lens and with the stated one
+    rms_px: float  # residual of a corner (both components), with this lens and with the stated one
     stated_rms_px: float
     used: tuple[str, ...]  # names of views
     left_out: tuple[str, ...]
@@ -100,7 +100,7 @@ def _row(values: ArrayLike) -> FloatArray:
 
 
 def _rms_px(views: Sequence[BoardView], matrix: FloatArray, lens: FloatArray) -> float:
-    """What a given lens leaves of the corners, each view with its own best pose."""
+    """Residual of the corners with a given lens, each view with its own best pose."""
     squares, count = 0.0, 0
     for view in views:
         _, turn, shift = cv2.solvePnP(view.place, view.seen_px, matrix, lens)

@@ -1,4 +1,4 @@
-"""What may be wrong with a bench, as one vector of named parameters around what is stated.
+"""Possible errors of a bench, as one vector of named parameters around the stated values.
 
 All are 0 for the stated bench. With hinge = F x O' / |F x O'| (world -y for the paper's bench), R(n, w) the turn by w
 about n, and the stated pinhole F0, camera rows C0, screen origin O0 and screen rows X0 (s_x, s_y, normal):
@@ -7,9 +7,9 @@ about n, and the stated pinhole F0, camera rows C0, screen origin O0 and screen 
     O' = R(hinge, -alpha) ((1 + b / |O0|) O0 + x s_x + y s_y)
     X = R(s_x, turn_x) R(s_y, turn_y) R(normal, turn_z) X0 R(hinge, -alpha)^T
 
-so that a, b and alpha are the paper's. A turn of everything about z would be seen by nothing: the camera's azimuth is
-therefore not among the parameters, it defines the direction of x. The other rigid motions are: two shifts, which the
-ring that stays where it is takes away, and two tilts, which only what was measured by hand takes away.
+so that a, b and alpha are the paper's. A turn of everything about z is unobservable: the camera's azimuth is
+therefore not a parameter and defines the direction of x. The other rigid motions are parameters: two shifts, which
+the fixed ring determines, and two tilts, which only hand measurements determine.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ class Parameter:
     """One number that may be wrong."""
 
     name: str  # ends in the unit
-    sigma: float  # what is known of it by hand, in that unit: a ruler, a laser meter, a protractor, a data sheet
+    sigma: float  # its hand measurement, in that unit: ruler, laser meter, protractor, data sheet
     says: str  # for a person
 
     @property
@@ -93,10 +93,10 @@ def usual_sigma(name: str) -> float:
 
 @dataclass(frozen=True)
 class BenchGeometry:
-    """A geometry with what `Geometry` cannot say."""
+    """A geometry with what `Geometry` does not hold."""
 
     geometry: Geometry  # camera and screen
-    pitch: float = 1.0  # true length of what the screen calls a millimetre
+    pitch: float = 1.0  # true length of the screen's nominal millimetre
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""What the calibration leaves uncertain of a figure: height, sag, Zernike terms, with and without a tilt.
+"""A figure's uncertainty after the calibration: height, sag, Zernike terms, with and without a tilt.
 
-A wrong geometry is answered by the fit with a wrong surface: dq = -(J_q^T W J_q)^-1 J_q^T W J_g dg, of which the
-blocks are at hand. The vertex is put where the laser says, with the laser's own error.
+With a wrong geometry the fit gives a wrong surface: dq = -(J_q^T W J_q)^-1 J_q^T W J_g dg, whose blocks are known.
+The laser sets the vertex, with its own error.
 """
 
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def surface_covariance(solution: Solution, index: int) -> FloatArray:
 
 
 def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Propagated:
-    """To what a person reads off a figure like that of one set."""
+    """Propagate to the quantities of a figure like that of one set."""
     covariance = surface_covariance(solution, index)
     heights, plane = disc(analysis_radius_mm / solution.problem.radius_mm)
     flat = without_plane(heights, plane)
@@ -74,10 +74,11 @@ def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", heights, covariance, heights))))
 
 
-# Which combinations of parameters the sets do not determine, and what a figure has of that, in words.
+# Which combinations of parameters the sets do not determine, and their effect on a figure, in words.
 #
-# In units of what was known by hand, the covariance has eigenvalues between 0 (the sets know far better) and 1 (they
-# know nothing). A combination near 1 is named by its largest parts and by what one sigma of it does to the surface.
+# In units of the hand measurements' sigmas, the covariance has eigenvalues between 0 (the sets know far better) and 1
+# (they know nothing). A combination near 1 is named by its largest parts and by the effect of one sigma on the
+# surface.
 
 WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
 _PART = 0.3  # of a unit combination: smaller parts are not named
@@ -91,13 +92,13 @@ class Combination:
 
     left: float  # sigma after over sigma before; 1: the sets say nothing
     parts: tuple[tuple[str, float], ...]  # of one sigma, in the parameters' units, the largest first
-    height_um: float  # what one sigma of it does to the surface, RMS, and without the best plane
+    height_um: float  # effect of one sigma on the surface, RMS, and without the best plane
     figure_um: float
-    words: str  # what that is
+    words: str  # name of that effect
 
 
 def condition_number(solution: Solution) -> float:
-    """Of the free parameters' covariance in units of what was known by hand."""
+    """Of the free parameters' covariance in units of the hand measurements' sigmas."""
     values = np.linalg.eigvalsh(_scaled(solution)[0])
     return float(values[-1] / values[0])
 
@@ -165,11 +166,11 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
 
 # What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
 #
-# A Hencky bowl at each depth is followed to the screen, and the problem is solved from there; its solution is the
-# bowl itself, and its covariance is what sets like these claim: within a tenth of what those of a rippled film do
+# Rays are followed from a Hencky bowl at each depth to the screen, and the problem is solved from there. Its solution
+# is the bowl itself, and its covariance is within a tenth of that claimed by sets of a rippled film
 # (docs/calibration.md).
 
-_ACROSS = 48  # rays along the picture's longer side; twice as many change no claim by a fiftieth
+_ACROSS = 48  # rays along the picture's longer side; twice as many change a claim by less than a fiftieth
 
 
 def foresee(

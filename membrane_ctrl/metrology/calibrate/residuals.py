@@ -8,8 +8,8 @@ u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
     du = (1 - 2 n n^T / (n n)) dd + B dn                 B = -2 / (n n) (n d^T + (d n) 1 - 2 (d n) / (n n) n n^T)
     ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
 
-with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that stands off by
-w = c s^2 + map (see `screen_face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that deviates by w
+= c s^2 + map (see `screen_face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Small matrix products as plain loops.
 #
-# A linear algebra library keeps its own threads, and on a machine that the control loop shares they wait for each
-# other: products of 40 by 40 then take five times as long as these loops on one core.
+# A linear algebra library has its own threads, which wait for each other on a machine shared with the control loop:
+# products of 40 by 40 then take five times as long as these loops on one core.
 
 _BLOCK = 512  # columns that stay in the second-level cache
 
@@ -73,7 +73,7 @@ _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
 @dataclass(frozen=True)
 class SetPhases:
-    """What one capture set says, as screen points of bins."""
+    """One capture set as screen points of bins."""
 
     name: str
     column_px: FloatArray  # (n,): centres of the bins
@@ -141,7 +141,7 @@ def _parts(count: int) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class _Meeting:
-    """Where rays meet film and screen; vectors are (3, m)."""
+    """Points where rays meet film and screen; vectors are (3, m)."""
 
     ray: FloatArray
     t_mm: FloatArray
@@ -177,7 +177,7 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -
 def _derivatives(
     bench: BenchGeometry, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray
 ) -> FloatArray:
-    """(2, COLUMNS, m) by the formulas above, right to left: what a change of P, u, n, d does to s."""
+    """(2, COLUMNS, m) by the formulas above, right to left: the effect on s of a change of P, u, n, d."""
     geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
     axes = geometry.screen_axes
     across, onto = axes[:2] @ u, np.sum(m.face * u, axis=0)  # E u, N u

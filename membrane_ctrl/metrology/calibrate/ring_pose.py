@@ -1,7 +1,7 @@
 """The camera's pose from the ring: a circle of known radius is seen as an ellipse, whose five numbers are its pose.
 
-The sixth, a turn of everything about z, is seen by nothing and defines x (`parameters`). What is fitted is the
-distance to the ring of the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
+The sixth, a turn of everything about z, is unobservable and defines x (`parameters`). The fit minimises the distance
+from the ring to the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
 """
 
 from dataclasses import dataclass
@@ -19,24 +19,24 @@ POSE_NAMES = ("a_mm", "alpha_deg", "camera_yaw_deg", "camera_pitch_deg", "camera
 _PLACES = [NAMES.index(name) for name in POSE_NAMES]
 _UNITS = np.array([usual_sigma(name) for name in POSE_NAMES])  # so that the solver's steps are of one size
 _POINTS = 720
-_REACH_PX = 8.0  # each way from where the rim was seen roughly
+_REACH_PX = 8.0  # each way from the rough rim
 _STEP_PX = 0.25
 _LEAST_FOUND = 0.5  # of the rim: less is no ellipse
-# A threshold on a blurred edge stands off by the blur's own asymmetry: what a whole rim may have in common
+# A threshold on a blurred edge is off by the blur's asymmetry, which a whole rim may share
 EDGE_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True)
 class RingPose:
-    """What the rim says."""
+    """The pose that the rim gives."""
 
     values: FloatArray  # (5,): of `POSE_NAMES`, 0 for the stated bench
     sigmas: FloatArray  # (5,)
-    rms_px: float  # what is left of an edge
+    rms_px: float  # residual of an edge
     points: int  # edges that were used
 
     def bench(self, stated: Geometry) -> Geometry:
-        """The stated bench, the camera where the rim says, the screen moved with alpha."""
+        """The stated bench with the camera at the rim's pose and the screen moved with alpha."""
         return _bench(stated, self.values)
 
 
@@ -48,9 +48,9 @@ def ring_pose(
     rim_z: HeightFunction,
     radius_sigma_mm: float,
 ) -> RingPose:
-    """Fit the pose, and weigh it with what is known by hand (`parameters.POSE`).
+    """Fit the pose, weighted with the hand measurements (`parameters.POSE`).
 
-    Raises ValueError if half of the rim, or more, is not to be seen.
+    Raises ValueError if half of the rim or more is not visible.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ def ring_pose(
     rough_px : (2, n) array
         The rim as `geometry.find_outline` sees it, to within `_REACH_PX`.
     rim_z : height function
-        Where the rim stands in world; a ring is flat, the rim of a mounted film nearly.
+        Height of the rim in world; a ring is flat, the rim of a mounted film nearly.
     radius_sigma_mm : float
-        How well the radius is known: that goes into `a_mm`.
+        How well the radius is known, which enters `a_mm`.
     """
     edges = rim_edges(light, rough_px)
     if edges.shape[1] < _LEAST_FOUND * _POINTS:
@@ -113,7 +113,7 @@ def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
     below = values < half[:, None]
     k = np.argmax(below, axis=1)
     seen = np.isfinite(values).all(axis=1) & (k > 0) & (inside - outside > np.nanmax(inside) / 4)
-    # one edge and no more: a line that is lit again further out crosses something else
+    # exactly one edge: a line that is lit again further out crosses something else
     seen &= (np.diff(below.astype(int), axis=1) != 0).sum(axis=1) == 1
     n = np.flatnonzero(seen)
     k = k[n]

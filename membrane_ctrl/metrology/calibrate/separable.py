@@ -1,13 +1,13 @@
-"""Normal equations of one set, and its surface taken out of them (variable projection).
+"""Normal equations of one set, with its surface eliminated (variable projection).
 
 The unknowns of set i are its surface q_i (36) and the height z_i of its vertex; those of all sets are the geometry's
 parameters, the ring's form and the laser's scale. The Schur complement over (q_i, z_i) leaves a matrix of the common
 unknowns alone. These matrices add, so that the cost grows with the number of sets and not with its cube, and any
 subset of the sets, and any choice of free parameters, can be solved again without another look at the points.
 
-Two more observations a set stand in the same matrix. The ring stays where it is: the harmonics 0..7 of the height of
-the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The vertex stands where
-the laser says: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
+Each set adds two more observations to the same matrix. The ring does not move: the harmonics 0..7 of the height of
+the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The laser gives the
+vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ _HUBER = 1.9  # of the length of two normal components: keeps 95 % of the effici
 
 @dataclass(frozen=True)
 class SetState:
-    """Where a set's own unknowns stand: its surface, and the height of its vertex in mm."""
+    """Values of a set's own unknowns: its surface, and the height of its vertex in mm."""
 
     surface: Surface
     vertex_z_mm: float
@@ -35,9 +35,9 @@ class SetState:
 
 @dataclass(frozen=True)
 class References:
-    """What is known beside the fringes."""
+    """Knowledge besides the fringes."""
 
-    reference_um: float  # laser reading at which the vertex stands at z = 0
+    reference_um: float  # laser reading at which the vertex is at z = 0
     laser_sigma_um: float = 1.0  # of a set's mean reading
     # the clamp creeps by less than a micrometre in the minutes that a calibration takes
     ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
@@ -45,28 +45,28 @@ class References:
 
 @dataclass(frozen=True)
 class Trust:
-    """How points are believed: robust weights (n,), 1 for a good one, and their variance over the expected one."""
+    """Robust weights (n,) of points, 1 for a good one, and their variance over the expected one."""
 
     weights: FloatArray
     variance: float
 
     @classmethod
     def full(cls, phases: residuals.SetPhases) -> "Trust":
-        """Every point as its noise says."""
+        """Every point with the weight of its noise."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
     def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> "Trust":
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
-        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not believed
+        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not accepted
         variance = max(float(np.median(length) / 1.1774) ** 2, 1.0)
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Everything one set says, linearised where its unknowns stand."""
+    """The equations of one set, linearised at its unknowns."""
 
     # (LOCAL + COMMON + 1, squared): J^T W J of the prediction's derivatives, with the residual as one more column:
     # normal matrix, right side and sum of squares in one
@@ -77,7 +77,7 @@ class Equations:
 
     @property
     def variance(self) -> float:
-        """How many times larger than expected the variance of the points was taken to be."""
+        """Assumed variance of the points over the expected one."""
         return self.trust.variance
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
@@ -156,10 +156,10 @@ def rim_harmonics() -> FloatArray:
     return np.asarray(waves @ heights.T * 2 / theta.size)
 
 
-# Hundreds of thousands of bins as a few thousand points that say the same.
+# Hundreds of thousands of bins as a few thousand points with the same information.
 #
-# About a bench and a surface that are nearly right, what is left of the seen screen points is smooth but for noise:
-# its mean over a cell of the picture keeps all that it says. The cell's point is the model's at its middle plus that
+# About a bench and a surface that are nearly right, the residual of the seen screen points is smooth but for noise:
+# its mean over a cell of the picture keeps all information. The cell's point is the model's at its middle plus that
 # mean.
 
 

@@ -12,19 +12,19 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray
 
 MAX_ITERATIONS = 25
-_SETTLED = 1e-2  # of each parameter's own standard deviation: no reader of the result sees less
+_SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
 _NEARLY = 0.1  # likewise: the next step is far below the noise
 _FEW = 4000  # points of a set: a hundred times its unknowns
-_FURTHEST = 4.0  # of what is known by hand; sets that contradict each other would lead out of the room
+_FURTHEST = 4.0  # in sigmas of the hand measurements; sets that contradict each other would lead out of the room
 _START_SAG_MM = 40.0
 _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be solved."""
+    """The problem to solve."""
 
-    stated: Geometry  # what was measured by hand
+    stated: Geometry  # as measured by hand
     sets: tuple[residuals.SetPhases, ...]  # at different sags
     sigmas: FloatArray  # (len(NAMES),): of the hand's measurements; 0 holds a parameter
     references: separable.References  # laser and ring
@@ -33,7 +33,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where the unknowns ended, and the equations there."""
+    """The unknowns at the solution, and the equations there."""
 
     problem: Problem  # as given, many bins averaged
     values: FloatArray  # (len(NAMES),): parameters, 0 for the stated bench
@@ -61,7 +61,7 @@ class Solution:
 
 
 def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
-    """What is known without the sets, as sums (COMMON + 1, squared) about where the unknowns stand."""
+    """The knowledge without the sets, as sums (COMMON + 1, squared) about the present unknowns."""
     wide = np.append(sigmas, np.full(separable.COMMON - len(parameters.NAMES), _FREE_RING_MM))
     weight = np.divide(1, wide**2, out=np.zeros(separable.COMMON), where=wide > 0)
     rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
@@ -78,7 +78,7 @@ class SolverStep:
 
 
 def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
-    """Solve for what is free. `sums` (COMMON + 1, squared) hold the sets and the prior."""
+    """Solve for the free unknowns. `sums` (COMMON + 1, squared) hold the sets and the prior."""
     free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
     scale = 1 / np.sqrt(np.diag(matrix))  # parameters have units of their own: the scaled matrix loses fewer digits
@@ -94,12 +94,12 @@ def solve(
 ) -> Solution:
     """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
 
-    Raises ValueError if there is no set, or if a set's points do not determine a surface. `progress` is told the
-    number of the step and its largest change in standard deviations; `start` is a solution of the same sets.
+    Raises ValueError if there is no set, or if a set's points do not determine a surface. `progress` gets the number
+    of the step and its largest change in standard deviations; `start` is a solution of the same sets.
     """
     if not problem.sets:
         raise ValueError("no capture set to calibrate with")
-    with np.errstate(over="ignore", invalid="ignore"):  # a divergence is told by its numbers, below
+    with np.errstate(over="ignore", invalid="ignore"):  # the numbers show a divergence, below
         return _solve(problem, progress, start)
 
 
@@ -108,7 +108,7 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = _solve(some, progress, None)
         if not start.converged:
-            return start  # means about a bench that is none would be no points of any
+            return start  # means about a diverged bench would be meaningless
         pairs = zip(problem.sets, start.states, strict=True)
         problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
@@ -137,8 +137,8 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
         states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
-        # Weights are renewed where the steps have nearly come to rest (renewed at every step they may chase it), and
-        # where points that are believed too much lead astray
+        # Weights are renewed where the steps have nearly converged (at every step, the two may chase each other), and
+        # where points with too much weight lead astray
         weighed = changes[-1] < _NEARLY or far > _FURTHEST
         if weighed:
             left = (each.residual_mm for each in linear)
@@ -163,7 +163,7 @@ def _moved(state: separable.SetState, linear: separable.Equations, common_step: 
 
 
 def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
-    """The sets' surfaces as the stated geometry sees them. Raises ValueError if there is none."""
+    """The sets' surfaces with the stated geometry. Raises ValueError if there is none."""
     return tuple(_first(problem, phases) for phases in problem.sets)
 
 

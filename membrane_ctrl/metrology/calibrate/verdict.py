@@ -1,4 +1,4 @@
-"""May a solution be used? What speaks against it, in one line each, the cause before its consequences."""
+"""May a solution be used? The objections, one line each, the cause before its consequences."""
 
 from dataclasses import dataclass, replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.metrology.calibrate import diagnose, parameters, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
 
-# Sets closer together than this tell no more than one set: the sag's sigma is then twice that of sets 8 mm apart
+# Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets 8 mm apart
 LEAST_SPREAD_UM = 1000.0
 GOOD_SPREAD_UM = 8000.0
 # A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit or sign by more
@@ -15,21 +15,21 @@ _SLOPE_OFF = 0.2
 _LASER_SIGMAS = 10.0  # of one reading: below, the fringes are as likely to be wrong
 _FEW_POINTS = 500  # of a set: ten times its unknowns
 _SCATTER = 3.0  # times the others' noise
-# noise of nanometres lets effects be seen that nobody needs to know: what is asked of a figure is 5 um
+# with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 um
 _HARMLESS_UM = 2.5
 
 
 @dataclass(frozen=True)
 class CalibrationFinding:
-    """Something that is not as it should be."""
+    """Something that is wrong."""
 
-    fatal: bool  # whether the old geometry has to stay in force
+    fatal: bool  # whether the old geometry stays in force
     says: str  # one line for a person
     sets: tuple[int, ...] = ()  # sets it is about; empty for all of them
 
 
 def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
-    """What can be seen without solving: sets too close together, a laser that counts another way."""
+    """Findings without solving: sets too close together, a laser with another scale or sign."""
     moved = np.array([phases.displacement_um for phases in problem.sets])
     known = np.isfinite(moved)
     sag_um = np.array([1e3 * state.surface.sag_mm for state in first_states(problem)])
@@ -53,10 +53,10 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
 
 
 def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
-    """What the solution says of sets and model.
+    """Findings from the solution about sets and model.
 
-    One thing that is wrong makes many look wrong. Of all that would explain it the one that takes most out of the
-    sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait until it is gone.
+    One error makes many things look wrong. Of all explanations, the one that removes most from the sum of squares,
+    less two for each number it frees (Akaike's rule), is the cause; the others wait until it is gone.
     """
     if not solution.converged:
         return (_astray(solution),)
@@ -66,7 +66,7 @@ def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
 
 
 def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
-    """A camera that was bumped, a set that is bad, sets that do not belong together, each with what it explains."""
+    """A bumped camera, a bad set, sets that do not belong together, each with the share that it explains."""
     names = [phases.name for phases in solution.problem.sets]
     out = []
     for bump in diagnose.bumps(solution)[:1]:
@@ -104,7 +104,7 @@ def _astray(solution: Solution) -> CalibrationFinding:
 
 
 def _agree(problem: Problem) -> bool:
-    """Whether the sets have a bench in common; where they led astray few points show that they have not."""
+    """Whether the sets share one bench; a few points of each are enough to show that they do not."""
     few = replace(problem, sets=tuple(phases.thinned(_FEW_POINTS) for phases in problem.sets))
     try:
         solution = solve(few)
@@ -158,7 +158,7 @@ def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
 
 
 def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
-    """What the sets could have said if they were others."""
+    """What other sets would have determined."""
     moved = np.array([phases.displacement_um for phases in solution.problem.sets])
     if np.count_nonzero(np.isfinite(moved)) < 2:
         says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"

@@ -1,4 +1,4 @@
-"""Screen and camera of the twin: what the screen shows, seen in the film as it stands at the moment of exposure."""
+"""Screen and camera of the twin: the screen, seen in the film as it is at the moment of exposure."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -27,9 +27,9 @@ class OpticsRenderer:
 
     The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
     the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
-    `exact` traces every pixel at every displacement: slow, for sets that must be true to the last bit. At
-    `reference_um` the vertex stands at the origin of the geometry. Each picture has pixel noise of its own
-    (`camera.noise_adu`). Raises ValueError if the film's rim is not the configured one.
+    `exact` traces every pixel at every displacement: slow, for sets that must be exact. At `reference_um` the vertex
+    is at the origin of the geometry. Each picture has its own pixel noise (`camera.noise_adu`). Raises ValueError if
+    the film's rim is not the configured one.
     """
 
     optics: OpticsConfig
@@ -141,7 +141,7 @@ def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[Floa
 
 
 class FilmPosition(Protocol):
-    """Where the film truly is; `membrane_ctrl.sim.sensors.Truth` is one."""
+    """True position of the film; `membrane_ctrl.sim.sensors.Truth` is one."""
 
     @property
     def displacement_um(self) -> float:
@@ -163,9 +163,9 @@ class TwinOptics:
     """The optical half of the simulated bench: one film, one `screen`, one `camera`.
 
     The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless `film` is given.
-    Bowl and rim follow the truth: only the sag at displacement 0 is taken from it, once, at the first look. The
-    optics are true but for the geometry if `twin` has its own; without a reference displacement the geometry holds
-    for the film as it was at the first look.
+    Bowl and rim follow the truth; only the sag at displacement 0 is taken from it, once, at the first look. The
+    optics are the configured ones, except for the geometry if `twin` has its own; without a reference displacement
+    the geometry refers to the film at the first look.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class TwinOptics:
         return self._looked().film
 
     def expose(self, out: Pixels | None) -> Frame:
-        """Take one picture of what the screen shows, now."""
+        """Take one picture of the screen now."""
         if self.screen.shown is None:
             raise LinkError("twin camera: the screen shows nothing: show a pattern first")
         return self._expose(self.screen.shown, out)

@@ -1,4 +1,4 @@
-"""Shape of the film: a bowl, Zernike terms, and what 36 Zernike terms cannot carry.
+"""Shape of the film: a bowl, Zernike terms, and what 36 Zernike terms cannot represent.
 
 Frame: the mirror's own, x horizontal, y up, height h above the vertex, h(0, 0) = 0. The displacement's zero is where
 the bowl has `sag_mm`; the rim stays where it is, so the bowl is `sag_mm + displacement` deep and everything else
@@ -64,7 +64,7 @@ def height_and_slopes(terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float)
     h, hx, hy = h + value, hx + value_x, hy + value_y
 
     for n in range(terms.wrinkles.shape[0]):
-        # amplitude Re((X + iY)^m e^(i phase)): m lobes that live at the rim
+        # amplitude Re((X + iY)^m e^(i phase)): m lobes at the rim
         amplitude, phase = terms.wrinkles[n, 0], terms.wrinkles[n, 2]
         below, order = complex(cos(phase), sin(phase)), int(terms.wrinkles[n, 1])
         for _ in range(order - 1):

@@ -1,6 +1,6 @@
 """Turns traced nodes into counts: one compiled pass over the picture, about ten nanoseconds per pixel.
 
-Nodes stand every `step` pixels, one before the first pixel and two after the last. Between them a cubic through four
+Nodes are `step` pixels apart, one before the first pixel and two after the last. Between them a cubic through four
 nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing is interpolated.
 """
 
@@ -56,7 +56,7 @@ def _random_64(state: np.uint64) -> np.uint64:
 
 @njit(cache=True)
 def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
-    """Light of the screen at s from the region's low edge; the caller has made sure that 0 <= s < side."""
+    """Light of the screen at s from the region's low edge; the caller ensures 0 <= s < side."""
     place = s_mm / cell_mm
     cell = int(place)
     if not smooth:

@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
 
-# Camera and screen of the twin as exact poses: rays from the pinhole, and the plane where they end.
+# Camera and screen of the twin as exact poses: rays from the pinhole, and the plane in which they end.
 #
 # World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
 _UNDISTORT_STEPS = 200  # each gains about a digit with a usual lens
@@ -112,7 +112,7 @@ def _undistorted(x_d: FloatArray, y_d: FloatArray, distortion: tuple[float, ...]
 
 
 def _short(geometry: GeometryConfig) -> tuple[float, float, float]:
-    """a in mm, b in mm, alpha in rad; the configuration has made sure that one of the two forms is complete."""
+    """a in mm, b in mm, alpha in rad; the configuration ensures that one of the two forms is complete."""
     if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
         raise ValueError("geometry: neither a_mm, b_mm, alpha_deg nor camera and screen poses")
     return geometry.a_mm, geometry.b_mm, radians(geometry.alpha_deg)
