@@ -5,20 +5,23 @@ from enum import IntEnum
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety
 from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.recorder import summary_panel
+from membrane_ctrl.run_files import shapes, streams
 
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
     """The layout of a run; it has a shape tab only if the shape is measured."""
-    tabs = [_overview(config), _loop(config), _environment(config), _timing(), _long_review()]
+    tabs = [_overview(config), _loop(config), _environment(config), _timing()]
     if config.shape.enabled:
         tabs.insert(2, _shape(config))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline="run_time"),
+        rrb.TimePanel(state="collapsed", timeline="utc"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
@@ -31,21 +34,29 @@ def _whole_run() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=everything)
 
 
-def _plot(name: str, *paths: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+def _plot(name: str, *paths: str, span: tuple[float, float] | None = None, marks: bool = False) -> rrb.TimeSeriesView:
+    """Plot entities; lines of commands and faults only with a span, as they would stretch any other axis."""
+    lines = [stream.path for stream in streams.MARKS] if marks else []
     return rrb.TimeSeriesView(
         name=name,
         origin="/",
-        contents=[f"+ {path}" for path in paths],
+        contents=[f"+ {path}" for path in (*lines, *paths)],
         axis_x=_whole_run(),
         axis_y=None if span is None else rrb.ScalarAxis(range=span),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),  # over the oldest data
     )
 
 
 def _error(config: Config) -> rrb.TimeSeriesView:
-    """Plot the error over twice the band: the start, tens of um off, would make the hold invisible."""
-    span = (-2 * config.limits.band_um, 2 * config.limits.band_um)
-    return _plot("Error and band, um", "/loop/error", "/truth/error", "/loop/band", span=span)
+    return _around_band(
+        config, "Error of each second: least, mean, greatest, µm", "/overview/error", "/overview/truth/error"
+    )
+
+
+def _around_band(config: Config, name: str, *paths: str) -> rrb.TimeSeriesView:
+    """Plot over twice the band: the start, tens of um off, would make the hold invisible."""
+    band_um = config.limits.band_um
+    return _plot(name, "/loop/band", *paths, span=(-2 * band_um, 2 * band_um), marks=True)
 
 
 def _lanes() -> rrb.StateTimelineView:
@@ -53,74 +64,93 @@ def _lanes() -> rrb.StateTimelineView:
     return rrb.StateTimelineView(name="States", origin="/state", contents=contents, time_view=_whole_run())
 
 
+_NO_TIME = TimelineColumn("utc", visible=False)  # too narrow to read: the lines begin with it
+
+
 def _text_log() -> rrb.TextLogView:
     return rrb.TextLogView(
-        name="Events",
+        name="Events, UTC",
         origin="/events",
-        columns=rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["loglevel", "body"]),
+        columns=rrb.TextLogColumns(timeline_columns=[_NO_TIME], text_log_columns=["loglevel", "body"]),
+        format_options=rrb.TextLogFormat(monospace_body=False),
     )
 
 
 def _overview(config: Config) -> rrb.Vertical:
-    return rrb.Vertical(
+    position = ("/overview/loop/position", "/overview/truth/displacement")
+    plots = rrb.Vertical(
         _error(config),
-        _plot("Setpoint, reading and true centre, um", "/loop/position", "/truth/displacement"),
-        rrb.Horizontal(_lanes(), _text_log(), column_shares=[3, 2]),
-        rrb.Horizontal(_plot("Pump", "/pump/drive"), _plot("Flow and leak, um/s", "/loop/flow")),
-        row_shares=[3, 2.5, 2.5, 2],
-        name="Overview",
+        _plot("Setpoint, reading and true centre, mean of each second, µm", *position),
+        rrb.Horizontal(
+            _plot("Pump and vent, mean of each second", "/overview/pump/drive"),
+            _plot("Flow and leak, mean of each second, µm/s", "/overview/loop/flow"),
+        ),
+        _lanes(),
+        row_shares=[3, 1.7, 1.7, 2.2],
     )
+    page = rrb.TextDocumentView(name="Summary", origin=summary_panel.PATH)
+    return rrb.Vertical(
+        rrb.Horizontal(plots, page, column_shares=[3.2, 1]), _text_log(), row_shares=[4.4, 1], name="Overview"
+    )
+
+
+_TICKS = "every tick around events, else one a second"
 
 
 def _loop(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
-        _error(config),
-        _plot("P, I, D and feed-forward, um/s", "/loop/terms"),
-        _plot("Flow wanted, flow and leak, um/s", "/loop/flow"),
+        _around_band(config, f"Error and band, {_TICKS}, µm", "/loop/error", "/truth/error"),
+        _plot("Setpoint, reading and true centre, µm", "/loop/position", "/truth/displacement"),
+        _plot("P, I, D and feed-forward, µm/s", "/loop/terms"),
+        _plot("Flow wanted, flow and leak, µm/s", "/loop/flow"),
         _plot("Pump and vent", "/pump/drive"),
+        row_shares=[3, 2, 2, 2, 2],
         name="Loop",
     )
 
 
 def _environment(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
-        _plot("Ambient pressure, Pa", "/ambient/pressure"),
-        _plot("Gauge pressure, Pa", "/gas/pressure"),
-        _plot("Temperatures, C", "/ambient/temperature", "/gas/temperature"),
+        _plot("Ambient pressure, mean of each second, Pa", "/overview/ambient/pressure"),
+        _plot(f"Gauge pressure, {_TICKS}, Pa", "/gas/pressure"),
+        _plot("Temperatures, °C", "/ambient/temperature", "/gas/temperature"),
         _error(config),
         name="Environment",
     )
 
 
+def _map(kind: str, name: str) -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(name=name, origin=f"/shape/map/{kind}")
+
+
 def _shape(config: Config) -> rrb.Vertical:
-    maps = [
-        rrb.Spatial2DView(name=name, origin=f"/shape/map/{kind}")
-        for kind, name in (
-            ("height", "Height"),
-            ("difference", "Difference to the first of hold"),
-            ("uncertainty", "Uncertainty, 1 sigma"),
-        )
-    ]
-    band = config.limits.band_um
-    pictures = [rrb.TextDocumentView(name="Colours", origin="/shape/legend")]
+    maps = rrb.Horizontal(
+        _map("height", "Height, mm"),
+        _map("difference", "Change since hold began, µm"),
+        rrb.Tabs(
+            _map("difference_no_defocus", "Less piston, tilt, defocus"),
+            _map("difference_no_tilt", "Less piston, tilt"),
+            active_tab=0,
+        ),
+        _map("scatter", "Standard deviation, µm"),
+        _map("uncertainty", "Noise of a cycle, 1σ, µm"),
+        rrb.TextDocumentView(name="Colours", origin="/shape/legend"),
+    )
+    band_um = config.limits.band_um
     rows = [
-        rrb.Horizontal(*maps, *pictures, column_shares=[1, 1, 1, 1]),
+        maps,
         rrb.Horizontal(
-            _plot(
-                "Sag change by the camera and by the laser, um",
-                "/shape/sag_change",
-                "/shape/trim",
-                span=(-band, band),
-            ),
-            _plot("Low orders, change since hold began, um", "/shape/change", span=(-band / 4, band / 4)),
-            rrb.BarChartView(name="Change of Z2..Z36, um", origin="/shape/change_bars"),
+            _plot("Sag change by camera and laser, trim, µm", "/shape/sag_change", "/shape/trim",
+                  span=(-band_um, band_um), marks=True),
+            _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
+            rrb.BarChartView(name="Change of Z2..Z36, µm", origin=shapes.BARS_PATH),
         ),
         rrb.Horizontal(
-            _plot("Slope residual, urad", "/shape/residual"),
+            _plot("Slope residual, µrad", "/shape/residual"),
             _plot("Fringe quality", "/shape/quality"),
             _plot("Last frame to result, ms", "/shape/latency"),
         ),
-    ]
+    ]  # fmt: skip
     if config.recording.thumbnails:
         names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
         rows.append(rrb.Horizontal(*(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)))
@@ -134,16 +164,6 @@ def _timing() -> rrb.Vertical:
         _plot("Ticks missed so far", "/tick/missed"),
         _plot("Last frame to result, ms", "/shape/latency"),
         name="Timing",
-    )
-
-
-def _long_review() -> rrb.Vertical:
-    return rrb.Vertical(
-        _plot("Error: minimum, mean and maximum of each second, um", "/overview/error", "/loop/band"),
-        _plot("Trim, um", "/shape/trim"),
-        _lanes(),
-        _text_log(),
-        name="Long review",
     )
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate
+from membrane_ctrl.model import files, object_codec, plain_json, run_events, run_status, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
-from membrane_ctrl.recorder import housekeeping, rerun_output, sink
-from membrane_ctrl.run_files import events, tables
+from membrane_ctrl.recorder import housekeeping, rerun_output, sink, summary_panel
+from membrane_ctrl.run_files import events, run_folder, tables
 from membrane_ctrl.run_files.summary import Summary
 
 # A ring as the recorder reads it: each message once, even when a new recorder continues after a killed one.
@@ -148,11 +148,14 @@ class Recorder:
         }
         self._errors = sink.RecorderErrors(report, before.errors)
         self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
-        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors)
+        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors, self._summary_page)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
         self._events_file = events.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
+        self._status = run_status.RunStatus()
+        for told in run_folder.read_events(run_dir, []) if resumes else ():
+            self._status = self._status.after_event(told.event, told.mono_s)
         self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
         self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()
@@ -176,6 +179,7 @@ class Recorder:
         """Take events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
+            self._status = self._status.after_event(run_events.from_dict(event), float(event.get("mono_s") or 0.0))
             self.urgent |= event.get("kind") in events.URGENT
             self.ended |= event.get("kind") == "end"
         self._events += new
@@ -204,6 +208,9 @@ class Recorder:
         if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.detail):
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
+
+    def _summary_page(self) -> str:
+        return summary_panel.markdown(self._summary.as_dict(self._dropped(), {}), self._status, self._config)
 
     def _see_folder(self, now_s: float) -> None:
         """Continue in a new folder if the run's was removed: writing to a deleted file raises no error."""

@@ -1,13 +1,14 @@
 """Writes to Rerun every second, in segments; replaces the file of a dead writer."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.recorder import rerun_streams, sink
+from membrane_ctrl.recorder import rerun_streams, sink, summary_panel
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 
 # A full disk is retried this often, so that recording continues soon after a person makes room.
@@ -22,7 +23,7 @@ class FrameSource(Protocol):
 
 
 class RerunOutput:
-    """Streams and segments; the recording has no segment yet."""
+    """Streams and segments; the recording has no segment yet. `summary` makes the page of figures so far."""
 
     def __init__(
         self,
@@ -30,11 +31,14 @@ class RerunOutput:
         config: Config,
         thumbnails: FrameSource | None,
         errors: sink.RecorderErrors,
+        summary: Callable[[], str],
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
         self._thumbnails = thumbnails
         self._errors = errors
+        self._summary = summary
+        self._next_summary_s = -math.inf
         self._telemetry = rerun_streams.TelemetryStreams(recording, config)
         self.shapes = rerun_streams.ShapeStreams(recording)
         self.state = math.nan  # the controller's, in the last row
@@ -68,6 +72,7 @@ class RerunOutput:
             self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
             self._errors.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
             self._errors.guarded("shape streams", lambda: self._send_shapes(now_s, shapes, detail))
+            self._errors.guarded("summary page", lambda: self._send_summary(now_s, events))
             try:
                 self._recording.flush()
             except sink.RecordingError as error:
@@ -93,6 +98,13 @@ class RerunOutput:
         if self._thumbnails is not None and detail == DetailLevel.ALL:
             self._thumbnails.send(now_s)
 
+    def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
+        if now_s < self._next_summary_s and not any(event.get("kind") in summary_panel.AT_ONCE for event in events):
+            return
+        early = now_s < summary_panel.EARLY_S
+        self._next_summary_s = now_s + (summary_panel.EARLY_INTERVAL_S if early else summary_panel.INTERVAL_S)
+        self._recording.page(summary_panel.PATH, now_s, self._summary())
+
     def _begin_segment(self, now_s: float) -> bool:
         if now_s < self._retry_s:
             return False
@@ -110,6 +122,7 @@ class RerunOutput:
         self._segment_until_s = now_s + self._segment_s
         self._telemetry.start_segment()
         self.shapes.start_segment()
+        self._next_summary_s = -math.inf
         return True
 
     def _stop(self) -> None:

@@ -5,43 +5,30 @@ from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model import event_words, shape_estimate, telemetry
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
 
-# Events to Rerun: one line of the text log each.
+# Events to Rerun: the text log, and lines across plots.
 
 
 EVENTS_PATH = "/events"
 
-_LEVELS = {"fault": "ERROR", "recorder_error": "ERROR", "unreadable_event": "ERROR", "disk_low": "WARN"}
-_TIMES = frozenset({"time_utc", "mono_s", "kind"})
-
 
 def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
-    """Send events in order."""
+    """Send events in order: a sentence each, and vertical lines across plots."""
     if not events:
         return
     time_s = np.array([float(event.get("mono_s") or 0.0) for event in events])
-    texts = [event_text(event) for event in events]
-    levels = [_LEVELS.get(str(event.get("kind")), "INFO") for event in events]
+    # the log's own column of times is too narrow to read
+    texts = [f"{str(event.get('time_utc', ''))[11:19]} {event_words.sentence(event)}".strip() for event in events]
+    levels = [event_words.level(event) for event in events]
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
-
-
-def event_text(event: EventLine) -> str:
-    """One line: the kind, then the event's fields."""
-    details = [
-        f"{key} {_short(value)}" for key, value in event.items() if key not in _TIMES and value not in (None, "")
-    ]
-    return f"{event.get('kind', '?')}: {', '.join(details)}" if details else str(event.get("kind", "?"))
-
-
-def _short(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    for stream, marks_s, values in streams.mark_lines(events):
+        recording.scalars(stream.path, marks_s, values)
 
 
 # Fewer rows for the viewer while nothing happens; every tick is in the other files (docs/recording.md).
@@ -96,26 +83,42 @@ class TelemetryStreams:
     def __init__(self, recording: sink.Recording, config: Config) -> None:
         self._recording = recording
         self._band_um = config.limits.band_um
+        self._band = streams.band(self._band_um)
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
         self._codes: dict[str, float] = {}
+        self._banded = False
 
     def start_segment(self) -> None:
-        """Restart every lane: a new file does not know the last state of the previous one."""
+        """Restart lanes and band: a new file does not know the last state of the previous one."""
         self._codes.clear()
+        self._banded = False
 
     def send(self, rows: telemetry.Rows) -> None:
         """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
         if not len(rows):
             return
         self._send_streams(self._quiet.take(rows))
-        time_s = telemetry.column(rows, "mono_s")
-        ends_s = time_s[[0, -1]] if len(rows) > 1 else time_s
-        band = np.tile([self._band_um, -self._band_um], (len(ends_s), 1))
-        self._recording.scalars(streams.BAND.path, ends_s, band)
-        overview = streams.overview_um(rows)
-        if np.isfinite(overview).all():
-            self._recording.scalars(streams.OVERVIEW.path, time_s[len(rows) // 2 : len(rows) // 2 + 1], overview)
+        self._send_overview(rows)
         self._send_lanes(rows)
+
+    def _send_overview(self, rows: telemetry.Rows) -> None:
+        """Send one row for all of these, at the middle; the band to their end."""
+        time_s = telemetry.column(rows, "mono_s")
+        edge_s = time_s[-1:] if self._banded else time_s[[0, -1]]
+        self._banded = True
+        square = np.full((len(edge_s), 1), self._band_um**2)
+        self._recording.measurements(self._band.path, edge_s, np.zeros_like(square), square)
+        mean = streams.mean_row(rows)
+        true_um = telemetry.true_error_um(telemetry.columns(mean))
+        blocks = [(stream.path, stream.values(mean)) for stream in streams.MEANS]
+        blocks += [
+            (streams.OVERVIEW.path, streams.overview_um(rows)),
+            (streams.TRUE_MEAN.path, true_um[:, np.newaxis]),
+        ]
+        middle = len(rows) // 2
+        for path, values in blocks:
+            if np.isfinite(values).any():
+                self._recording.scalars(path, time_s[middle : middle + 1], values)
 
     def _send_streams(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.column(rows, "mono_s")
@@ -142,13 +145,16 @@ class TelemetryStreams:
 # Shape estimates to Rerun: the numbers of every cycle, and maps now and then.
 
 
-# A map takes 53 kB on disk: one difference a minute is 76 MB a day. Nothing is lost, as any map can be rebuilt from
-# the coefficients of its cycle. In the first minutes somebody is watching.
+# Three maps of the change a minute are 60 MB a day. Nothing is lost, as any map can be rebuilt from the coefficients
+# of its cycle. In the first minutes somebody is watching.
 DIFFERENCE_INTERVAL_S = 60.0
 DIFFERENCE_EARLY_S, EARLY_S = 10.0, 300.0
 MAP_INTERVAL_S = 600.0
-# The difference map's colours span at least this, so that noise does not look like a figure.
-_DIFFERENCE_LEAST_UM = 0.5
+# Colours span nearly all of a map: a few pixels at the edge must not hide the rest.
+_NEARLY_ALL = 0.99
+# Zernike terms removed from the maps of change (the mount tilts, the loop holds the bowl's depth), and the least span
+# of their colours, um: noise must not look like a figure.
+_CHANGES = {"difference": (0, 0.5), "difference_no_tilt": (3, 0.5), "difference_no_defocus": (4, 0.1)}
 
 
 class ShapeStreams:
@@ -161,7 +167,8 @@ class ShapeStreams:
         self._reference_from_s = -math.inf
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
-        self._colours: dict[str, tuple[float, float]] = {}
+        self._scatter = shapes.Scatter()
+        self._colours: dict[str, str] = {}
         self._verdict = ""
 
     def start_segment(self) -> None:
@@ -186,60 +193,63 @@ class ShapeStreams:
             return
         if self.reference is None or self.reference.time_s < self._reference_from_s <= estimate.time_s:
             self.reference, self._next_difference_s = estimate, -math.inf
-        for stream, values in _figure(estimate, self.reference).items():
-            self._recording.scalars(stream.path, time_s, np.array([values]))
+            self._next_map_s, self._scatter = -math.inf, shapes.Scatter()
+        self._scatter.add(estimate.coeffs_um)
+        self._recording.scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
+        for stream, (values, variances) in _changes(estimate, self.reference).items():
+            self._recording.measurements(stream.path, time_s, np.array([values]), np.array([variances]))
         change_um = (estimate.coeffs_um - self.reference.coeffs_um)[1:]
-        bars = rr.BarChart(change_um, abscissa=np.arange(2, 37))
-        self._recording.log("/shape/change_bars", estimate.time_s, bars)
+        self._recording.log(shapes.BARS_PATH, estimate.time_s, rr.BarChart.from_fields(values=change_um))
         if self.pictures:
             self._send_maps(estimate, self.reference)
 
     def _send_maps(self, estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> None:
         time_s = estimate.time_s
+        early = time_s - reference.time_s < EARLY_S
         if time_s >= self._next_map_s:
-            self._next_map_s = time_s + MAP_INTERVAL_S
-            height_mm = shapes.height_map_mm(estimate)
-            sigma_um = shapes.uncertainty_map_um(estimate.covariance_um2)
-            self._send_map("height", time_s, height_mm, "mm", _span(height_mm))
-            self._send_map("uncertainty", time_s, sigma_um, "um, 1 sigma", (0.0, _span(sigma_um)[1]))
+            self._next_map_s = time_s + (DIFFERENCE_INTERVAL_S if early else MAP_INTERVAL_S)
+            self._send_map("height", "mm", time_s, shapes.height_map_mm(estimate))
+            self._send_map("uncertainty", "µm", time_s, shapes.uncertainty_map_um(estimate.covariance_um2))
+            self._send_map("scatter", "µm", time_s, self._scatter.map_um())
         if time_s >= self._next_difference_s:
-            early = time_s - reference.time_s < EARLY_S
             self._next_difference_s = time_s + (DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S)
             difference_um = shapes.difference_map_um(estimate, reference)
-            most_um = max(_DIFFERENCE_LEAST_UM, *(abs(end) for end in _span(difference_um)))
-            self._send_map("difference", time_s, difference_um, "um", (-most_um, most_um))
-            legend = _legend(estimate, reference, self._colours)
-            self._recording.log("/shape/legend", time_s, rr.TextDocument(legend, media_type="text/markdown"))
+            for kind, (terms, least_um) in _CHANGES.items():
+                change_um = shapes.without_terms(difference_um, terms)
+                self._send_map(kind, "µm", time_s, change_um, least_um)
+            self._recording.page("/shape/legend", time_s, _legend(estimate, reference, self._colours))
 
     def _send_map(
-        self, kind: str, time_s: float, values: NDArray[np.float32], unit: str, span: tuple[float, float]
+        self, kind: str, unit: str, time_s: float, values: shapes.Map, least_um: float | None = None
     ) -> None:
+        """Send a map; with `least_um` in diverging colours, which span at least that, around 0."""
+        most = float(np.nanquantile(np.abs(values), _NEARLY_ALL))
+        span = (0.0, most) if least_um is None else (-max(least_um, most), max(least_um, most))
         # NaN is drawn like the lowest value: a mask covers it (`outside`, sent once per file)
-        picture = rr.DepthImage(values, colormap="turbo", depth_range=span)
+        picture = rr.DepthImage(
+            values if unit == "mm" else values.astype(np.float16),  # millimetres need more than three digits
+            colormap="Viridis" if least_um is None else "CyanToYellow",
+            depth_range=span,
+        )
         self._recording.log(f"/shape/map/{kind}", time_s, picture)
-        self._colours[f"{kind}, {unit}"] = span
-
-
-def _span(values: NDArray[np.float32]) -> tuple[float, float]:
-    return float(np.nanmin(values)), float(np.nanmax(values))
+        self._colours[kind] = f"{'0 to ' if least_um is None else '±'}{span[1]:.3g} {unit}"
 
 
 def _legend(
-    estimate: shape_estimate.ShapeEstimate,
-    reference: shape_estimate.ShapeEstimate,
-    colours: dict[str, tuple[float, float]],
+    estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate, colours: dict[str, str]
 ) -> str:
-    """Markdown: the meaning of the maps' colours, and one line per cycle."""
-    rows = "\n".join(f"| {name} | {low:.4g} | {high:.4g} |" for name, (low, high) in colours.items())
+    """Markdown: the ranges of the maps' colours, and one line per cycle."""
+    rows = "\n".join(f"| {name} | {colours[kind]} |" for kind, name in shapes.MAPS.items() if kind in colours)
     reason = f" ({estimate.reason})" if estimate.reason else ""
     of_geometry = estimate.geometry_sag_sigma_um
-    geometry = f", ± {of_geometry:.3g} um from geometry" if math.isfinite(of_geometry) else ""
+    geometry = f", ± {of_geometry:.3g} µm from geometry" if math.isfinite(of_geometry) else ""
     return (
-        f"| map | blue | red |\n|---|---|---|\n{rows}\n\n"
-        f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{reason}\n"
+        f"| map | colours |\n|---|---|\n{rows}\n\n"
+        "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of a map is in its range.\n\n"
+        f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{event_words.for_people(reason)}\n"
         f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
-        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} um from noise{geometry}\n"
-        f"- slope residual {estimate.slope_residual_urad:.2f} urad, {100 * estimate.valid_fraction:.1f} % valid\n"
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} µm from noise{geometry}\n"
+        f"- slope residual {estimate.slope_residual_urad:.2f} µrad, {100 * estimate.valid_fraction:.1f} % valid\n"
     )
 
 
@@ -252,14 +262,14 @@ def _quality(estimate: shape_estimate.ShapeEstimate) -> dict[streams.Stream, lis
     }
 
 
-def _figure(
+def _changes(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
-) -> dict[streams.Stream, list[float]]:
-    change_um = estimate.coeffs_um - reference.coeffs_um
-    sag_um, sigma_um = estimate.sag_um - reference.sag_um, estimate.sag_sigma_um
-    laser_um = estimate.displacement_um - reference.displacement_um
+) -> dict[streams.Stream, tuple[list[float], list[float]]]:
+    """Values and variances; these are of the noise of this cycle, as that of the reference shifts all alike."""
+    change_um, variances_um2 = estimate.coeffs_um - reference.coeffs_um, np.diag(estimate.covariance_um2)
+    sag_um = [estimate.sag_um - reference.sag_um, estimate.displacement_um - reference.displacement_um]
+    terms = [j - 1 for j in streams.LOW_ORDERS]
     return {
-        streams.ZERNIKE: list(estimate.coeffs_um),
-        streams.CHANGE: [float(change_um[j - 1]) for j in streams.LOW_ORDERS],
-        streams.SAG: [sag_um, sag_um + sigma_um, sag_um - sigma_um, laser_um],
+        streams.CHANGE: (change_um[terms].tolist(), variances_um2[terms].tolist()),
+        streams.SAG: (sag_um, [estimate.sag_sigma_um**2, 0.0]),
     }

@@ -97,7 +97,14 @@ class Recording:
         stream.send_recording_name(self._run_dir.name)
         stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
         for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS):
-            stream.log(block.path, _style(block), static=True)
+            stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
+        for block in (streams.band(self._config.limits.band_um), streams.CHANGE, streams.SAG):
+            stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
+        for block in streams.MARKS:  # the average of the lines in a pixel would be none
+            stream.log(block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True)
+        bars = rr.BarChart(np.zeros(35), abscissa=np.arange(2, 37)).as_component_batches()
+        abscissa = [part for part in bars if part.component_descriptor().component == "BarChart:abscissa"]
+        stream.log(shapes.BARS_PATH, abscissa, static=True)
         for lane in LANES:
             words = list(lane.colours)
             colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
@@ -108,7 +115,7 @@ class Recording:
             static=True,
         )
         outside = rr.SegmentationImage(shapes.outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0)
-        for kind in ("height", "difference", "uncertainty"):
+        for kind in shapes.MAPS:
             stream.log(f"/shape/map/{kind}/outside", outside, static=True)
 
     def columns(self, path: str, time_s: FloatArray, columns: Iterable[rr.ComponentColumn]) -> None:
@@ -124,12 +131,20 @@ class Recording:
         """Send (n, m) values of one entity at (n,) times of the run."""
         self.columns(path, time_s, rr.Scalars.columns(scalars=values))
 
+    def measurements(self, path: str, time_s: FloatArray, values: FloatArray, variances: FloatArray) -> None:
+        """Send (n, m) values of one entity with their variances at (n,) times of the run."""
+        self.columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
+
     def log(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
         """Send one component at one time of the run."""
         nanoseconds = np.timedelta64(round(time_s * 1e9), "ns")
         self._stream.set_time(RUN_TIME, duration=nanoseconds)
         self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
         self._stream.log(path, archetype)
+
+    def page(self, path: str, time_s: float, markdown: str) -> None:
+        """Send a page of text at one time of the run."""
+        self.log(path, time_s, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def lay_out_again(self) -> None:
         """Send the blueprint with the next segment, which is now the first in the folder."""
@@ -180,13 +195,10 @@ def is_whole(path: Path) -> bool:
     return True
 
 
-def _style(stream: streams.Stream) -> rr.SeriesLines:
-    lines = stream.lines
-    return rr.SeriesLines(
-        names=[line.name for line in lines],
-        colors=[line.colour for line in lines],
-        widths=[line.width for line in lines],
-    )
+def _styled(archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object) -> rr.AsComponents:
+    """Names, colours and widths of a stream's lines."""
+    names, colours, widths = zip(*((line.name, line.colour, line.width) for line in stream.lines), strict=True)
+    return archetype(names=names, colors=colours, widths=widths, **more)
 
 
 # Errors of the recorder: each is reported once until it changes, and none ends the recorder.

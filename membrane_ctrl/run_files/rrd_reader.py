@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from rerun.chunk import Chunk
 
 REPAIRED = "repaired"  # below the run: files repaired by `repair`
-_VALUES = "Scalars:scalars"
+_VALUES = ("Scalars:scalars", "Measurements:values")
+_VARIANCES = "Measurements:variances"
 _TIME = "run_time"
 
 
@@ -58,7 +59,7 @@ def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, 
 
 def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
     """Read one segment's shape estimates: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
-    found = _scalars(path, {stream.path for stream in streams.SHAPE_STREAMS}, notes)
+    found = _scalars(path, {stream.path for stream in (*streams.SHAPE_STREAMS, streams.SAG)}, notes)
     if streams.ZERNIKE.path not in found:
         return {}
     clock_ns, coeffs_um = found[streams.ZERNIKE.path]
@@ -71,12 +72,16 @@ def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
         return values
 
     sag_um = at(streams.SAG.path, 0)
+    if streams.SAG.path + _VARIANCES in found:
+        sigma_um, laser = np.sqrt(np.maximum(at(streams.SAG.path + _VARIANCES, 0), 0.0)), 1
+    else:  # earlier versions: sag, one sigma more, one less, laser
+        sigma_um, laser = at(streams.SAG.path, 1) - sag_um, 3
     return {
         "time_s": _seconds(clock_ns),
         "coeffs_um": coeffs_um,
         "sag_um": sag_um,
-        "sag_sigma_um": at(streams.SAG.path, 1) - sag_um,
-        "displacement_um": at(streams.SAG.path, 3),
+        "sag_sigma_um": sigma_um,
+        "displacement_um": at(streams.SAG.path, laser),
         "slope_residual_urad": at(streams.RESIDUAL.path, 0),
         "valid_fraction": at(streams.QUALITY.path, 0),
         "saturated_fraction": at(streams.QUALITY.path, 1),
@@ -108,13 +113,16 @@ def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tupl
 
 
 def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, IntArray, Column]]:
+    """Values of each entity, and its variances as those of another whose path ends in `_VARIANCES`."""
     for chunk in _readable(path, entities, notes):
         batch = chunk.to_record_batch()
-        if _VALUES not in batch.schema.names or _TIME not in batch.schema.names:
+        there = [name for name in (*_VALUES, _VARIANCES) if name in batch.schema.names]
+        if _TIME not in batch.schema.names:
             continue
-        cells = batch.column(_VALUES)
-        values = cells.flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
-        yield chunk.entity_path, batch.column(_TIME).cast("int64").to_numpy(), values
+        for name in there:
+            values = batch.column(name).flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
+            entity = chunk.entity_path + (name if name == _VARIANCES else "")
+            yield entity, batch.column(_TIME).cast("int64").to_numpy(), values
 
 
 def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]:

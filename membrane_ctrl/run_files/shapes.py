@@ -169,13 +169,23 @@ def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
     return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, 36, 36)
 
 
-# Maps of a shape estimate for the timeline: height, difference to the first, 1-sigma uncertainty.
+BARS_PATH = "/shape/change_bars"
+# The maps below `/shape/map/`, and their names for people.
+MAPS = {
+    "height": "height",
+    "difference": "change",
+    "difference_no_tilt": "change less piston, tilt",
+    "difference_no_defocus": "change less piston, tilt, defocus",
+    "scatter": "standard deviation so far",
+    "uncertainty": "noise of a cycle, 1σ",
+}
+
+# Maps of a shape estimate for the timeline: height, change since the first, 1-sigma uncertainty, scatter.
 
 
 Map = NDArray[np.float32]
 
-# 128 x 128 resolves all 36 terms (radial order 7) at 66 kB per map.
-MAP_PX = 128
+MAP_PX = 96  # resolves all 36 terms (radial order 7)
 
 
 def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
@@ -196,11 +206,36 @@ def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_e
     return _spread(change.height(*_points()) * 1e3)
 
 
+def without_terms(height: Map, terms: int) -> Map:
+    """A map less its best fit of the first Zernike terms: 3 removes piston and tilt, 4 defocus as well."""
+    values, basis = height[_inside()].astype(np.float64), _terms()[:terms]
+    return _spread(values - np.linalg.lstsq(basis.T, values, rcond=None)[0] @ basis)
+
+
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
     """Standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
-    terms = zernike.values(*_points())
-    variance = np.einsum("jp,jp->p", terms, covariance_um2 @ terms)
+    variance = np.einsum("jp,jp->p", _terms(), covariance_um2 @ _terms())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
+
+
+class Scatter:
+    """Covariance of the coefficients over the cycles so far (Welford's update)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._mean = np.zeros(shape_estimate.TERMS)
+        self._squares = np.zeros((shape_estimate.TERMS, shape_estimate.TERMS))
+
+    def add(self, coeffs_um: NDArray[np.float64]) -> None:
+        """Add (36,) coefficients."""
+        self.count += 1
+        off = coeffs_um - self._mean
+        self._mean = self._mean + off / self.count
+        self._squares += np.outer(off, coeffs_um - self._mean)
+
+    def map_um(self) -> Map:
+        """Standard deviation of the height, um; zero for one cycle."""
+        return uncertainty_map_um(self._squares / max(self.count - 1, 1))
 
 
 def outside_disc() -> NDArray[np.uint8]:
@@ -229,6 +264,12 @@ def _inside() -> NDArray[np.bool_]:
 def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, y = _grid()
     return x[_inside()], y[_inside()]
+
+
+@cache
+def _terms() -> NDArray[np.float64]:
+    """(36, points) the Zernike terms."""
+    return zernike.values(*_points())
 
 
 def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

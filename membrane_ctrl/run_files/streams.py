@@ -4,11 +4,13 @@ One entity of m scalars costs the writer and the viewer far less than m entities
 of the lines once.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import Rows, column
 
 Colour = tuple[int, int, int]
@@ -51,30 +53,30 @@ STREAMS: tuple[Stream, ...] = (
     Stream(
         "/loop/position",
         (
-            Line("displacement_um", "reading um", GREY, 1.0),
-            Line("filtered_um", "filtered um", BLUE),
-            Line("setpoint_um", "setpoint um", ORANGE),
-            Line("target_um", "target um", WHITE, 1.0),
+            Line("displacement_um", "reading µm", GREY, 1.0),
+            Line("filtered_um", "filtered µm", BLUE),
+            Line("setpoint_um", "setpoint µm", ORANGE),
+            Line("target_um", "target µm", WHITE, 1.0),
         ),
     ),
-    Stream("/truth/displacement", (Line("truth_displacement_um", "true centre um", GREEN, 2.0),)),
-    Stream("/truth/laser_bias", (Line("truth_laser_bias_um", "true laser mount drift um", RED),)),
-    Stream("/loop/error", (Line("error_um", "error um", BLUE),)),
+    Stream("/truth/displacement", (Line("truth_displacement_um", "true centre µm", GREEN, 2.0),)),
+    Stream("/truth/laser_bias", (Line("truth_laser_bias_um", "true laser mount drift µm", RED),)),
+    Stream("/loop/error", (Line("error_um", "error µm", BLUE),)),
     Stream(
         "/loop/terms",
         (
-            Line("p_um_per_s", "P um/s", BLUE),
-            Line("i_um_per_s", "I um/s", ORANGE),
-            Line("d_um_per_s", "D um/s", VIOLET),
-            Line("feedforward_um_per_s", "feed-forward um/s", GREEN),
+            Line("p_um_per_s", "P µm/s", BLUE),
+            Line("i_um_per_s", "I µm/s", ORANGE),
+            Line("d_um_per_s", "D µm/s", VIOLET),
+            Line("feedforward_um_per_s", "feed-forward µm/s", GREEN),
         ),
     ),
     Stream(
         "/loop/flow",
         (
-            Line("flow_wanted_um_per_s", "flow wanted um/s", GREY),
-            Line("flow_um_per_s", "flow um/s", BLUE),
-            Line("leak_um_per_s", "leak um/s", RED, 2.0),
+            Line("flow_wanted_um_per_s", "flow wanted µm/s", GREY),
+            Line("flow_um_per_s", "flow µm/s", BLUE),
+            Line("leak_um_per_s", "leak µm/s", RED, 2.0),
         ),
     ),
     Stream(
@@ -86,11 +88,11 @@ STREAMS: tuple[Stream, ...] = (
             Line("vent_readback_fraction", "vent read-back", VIOLET, 1.0),
         ),
     ),
-    Stream("/shape/trim", (Line("trim_um", "trim um", VIOLET, 2.0),)),
+    Stream("/shape/trim", (Line("trim_um", "trim µm", VIOLET, 2.0),)),
     Stream("/gas/pressure", (Line("gauge_pressure_pa", "gauge pressure Pa", BLUE),)),
     Stream("/ambient/pressure", (Line("ambient_pressure_pa", "ambient pressure Pa", ORANGE),)),
-    Stream("/ambient/temperature", (Line("air_temperature_c", "air C", ORANGE),)),
-    Stream("/gas/temperature", (Line("gas_temperature_c", "gas C", BLUE),)),
+    Stream("/ambient/temperature", (Line("air_temperature_c", "air °C", ORANGE),)),
+    Stream("/gas/temperature", (Line("gas_temperature_c", "gas °C", BLUE),)),
     Stream("/tick/lateness", (Line("lateness_ms", "lateness ms", BLUE),)),
     Stream("/tick/dt", (Line("dt_s", "time between ticks s", BLUE),)),
     Stream("/tick/missed", (Line("missed_ticks", "ticks missed so far", RED, 2.0),)),
@@ -111,50 +113,93 @@ STREAMS: tuple[Stream, ...] = (
 )
 
 # Computed here from the rows, so that plots need no arithmetic.
-TRUE_ERROR = Stream("/truth/error", (Line("", "target minus true centre um", GREEN, 2.0),))
-BAND = Stream("/loop/band", (Line("", "+band um", GREY, 1.0), Line("", "-band um", GREY, 1.0)))
+TRUE_ERROR = Stream("/truth/error", (Line("", "target minus true centre µm", GREEN, 2.0),))
 OVERVIEW = Stream(
     "/overview/error",
     (
-        Line("", "error, minimum of a second um", GREY, 1.0),
-        Line("", "error, mean of a second um", BLUE),
-        Line("", "error, maximum of a second um", GREY, 1.0),
+        Line("", "error, least of a second µm", GREY, 1.0),
+        Line("", "error, mean of a second µm", BLUE, 2.0),
+        Line("", "error, greatest of a second µm", GREY, 1.0),
     ),
 )
-DERIVED: tuple[Stream, ...] = (TRUE_ERROR, BAND, OVERVIEW)
+# A point per second all over the run: the others have every tick around events and one per second in quiet times, and
+# a line that changes its density looks as if the mirror had changed.
+_MEANS = {"/loop/position", "/truth/displacement", "/loop/flow", "/pump/drive", "/ambient/pressure"}
+MEANS = tuple(replace(stream, path=f"/overview{stream.path}") for stream in STREAMS if stream.path in _MEANS)
+TRUE_MEAN = replace(TRUE_ERROR, path="/overview/truth/error")
+DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
+
+
+def band(band_um: float) -> Stream:
+    """The area in which the error is to stay, drawn as the deviation of a line without width."""
+    return Stream("/loop/band", (Line("", f"band ±{band_um:g} µm", GREEN, 0.0),))
+
 
 # Low orders that a film shows, each worth a line. Noll index to name.
 LOW_ORDERS = {
-    4: ("defocus Z4 um", BLUE),
-    5: ("astigmatism Z5 um", ORANGE),
-    6: ("astigmatism Z6 um", YELLOW),
-    7: ("coma Z7 um", GREEN),
-    8: ("coma Z8 um", VIOLET),
-    11: ("spherical Z11 um", RED),
+    4: ("defocus Z4 µm", BLUE),
+    5: ("astigmatism Z5 µm", ORANGE),
+    6: ("astigmatism Z6 µm", YELLOW),
+    7: ("coma Z7 µm", GREEN),
+    8: ("coma Z8 µm", VIOLET),
+    9: ("trefoil Z9 µm", GREY),
+    10: ("trefoil Z10 µm", WHITE),
+    11: ("spherical Z11 µm", RED),
 }
 
-ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"Z{j} um", GREY) for j in range(1, 37)))
+ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"Z{j} µm", GREY) for j in range(1, 37)))
 CHANGE = Stream("/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values()))
-SAG = Stream(
-    "/shape/sag_change",
-    (
-        Line("", "sag change um", BLUE, 2.0),
-        Line("", "+1 sigma um", GREY, 1.0),
-        Line("", "-1 sigma um", GREY, 1.0),
-        Line("", "laser change um", ORANGE),
-    ),
-)
-RESIDUAL = Stream("/shape/residual", (Line("", "slope residual urad", BLUE),))
+SAG = Stream("/shape/sag_change", (Line("", "sag change ± 1σ µm", BLUE, 2.0), Line("", "laser change µm", ORANGE)))
+RESIDUAL = Stream("/shape/residual", (Line("", "slope residual µrad", BLUE),))
 QUALITY = Stream("/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line("", "saturated fraction", RED)))
 MODULATION = Stream("/shape/modulation", (Line("", "modulation ADU", BLUE),))
 LATENCY = Stream("/shape/latency", (Line("", "last frame to result ms", BLUE),))
-SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, CHANGE, SAG, RESIDUAL, QUALITY, MODULATION, LATENCY)
+SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
+
+
+# Vertical lines across plots of a fixed height, interrupted by NaN; an entity each, as a legend lists only those with
+# data.
+MARKS: tuple[Stream, ...] = (
+    Stream("/marks/fault", (Line("fault", "fault", RED, 2.0),)),
+    Stream("/marks/pause", (Line("pause", "pause, resume", YELLOW),)),
+    Stream("/marks/setpoint", (Line("setpoint", "setpoint", ORANGE),)),
+    Stream("/marks/command", (Line("command", "command", VIOLET),)),
+    Stream("/marks/mark", (Line("mark", "mark", WHITE),)),
+)
+_MARK_HALF_HEIGHT = 1e3  # in the units of any plot that has them
+
+
+def mark_lines(events: Sequence[EventLine]) -> Iterator[tuple[Stream, Column, FloatArray]]:
+    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical line for each."""
+    for stream in MARKS:
+        found = [float(event.get("mono_s") or 0.0) for event in events if _mark_kind(event) == stream.lines[0].field]
+        time_s = np.array(found)[:, np.newaxis] + [0.0, 0.0, 1e-9]
+        values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], len(found))
+        if found:
+            yield stream, time_s.ravel(), values[:, np.newaxis]
+
+
+def _mark_kind(event: EventLine) -> str:
+    if event.get("kind") != "command":
+        return str(event["kind"]) if event.get("kind") in ("fault", "mark") else ""
+    command = str(event.get("command"))
+    if event.get("refused"):
+        return ""
+    return {"setpoint": "setpoint", "pause": "pause", "resume": "pause", "mark": "mark"}.get(command, "command")
 
 
 def overview_um(rows: Rows) -> FloatArray:
-    """(1, 3) minimum, mean and maximum error of the rows; NaN if no row has an error."""
+    """(1, 3) least, mean and greatest error of the rows; NaN if no row has an error."""
     error = column(rows, "error_um")
     error = error[np.isfinite(error)]
     if not error.size:
         return np.full((1, 3), np.nan)
     return np.array([[error.min(), error.mean(), error.max()]])
+
+
+def mean_row(rows: Rows) -> Rows:
+    """(1, fields) mean of each field over the rows that have it; NaN where none has."""
+    there = np.isfinite(rows)
+    with np.errstate(invalid="ignore"):
+        mean: Rows = np.where(there, rows, 0.0).sum(axis=0, keepdims=True) / there.sum(axis=0, keepdims=True)
+    return mean

@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.run_files.shapes import MAP_PX, difference_map_um, height_map_mm, outside_disc, uncertainty_map_um
+from membrane_ctrl.run_files.shapes import (
+    MAP_PX,
+    Scatter,
+    difference_map_um,
+    height_map_mm,
+    outside_disc,
+    uncertainty_map_um,
+    without_terms,
+)  # fmt: skip
 from tests.support.synthetic_run import shape_of
 
 # pixel centres on the unit disc, row 0 on top
@@ -55,3 +63,34 @@ def test_uncertainty_agrees_with_drawn_coefficients() -> None:
     inside = np.isfinite(found)
     # 400 draws know a deviation to 3.5 %; four of that at the worst pixel
     assert np.abs(found[inside] / expected[inside] - 1).max() < 0.16
+
+
+@pytest.mark.parametrize(("terms", "removed"), [(0, ()), (3, (1, 2, 3)), (4, (1, 2, 3, 4))])
+def test_only_the_wanted_terms_are_removed(terms: int, removed: tuple[int, ...]) -> None:
+    coeffs_um = flat()
+    coeffs_um[:7] = 3.0, -0.5, 0.7, 2.0, 0.0, 0.4, 0.2
+    reference = shape_of(0.0, 0)
+    left = np.where(np.isin(np.arange(1, 37), removed), 0.0, coeffs_um)
+
+    def change_um(of: np.ndarray) -> np.ndarray:
+        return difference_map_um(replace(reference, coeffs_um=reference.coeffs_um + of), reference)
+
+    expected = change_um(left)
+    if terms:  # above its mean, not above its vertex
+        expected -= np.nanmean(expected)
+    assert without_terms(change_um(coeffs_um), terms) == pytest.approx(expected, abs=2e-3, nan_ok=True)
+
+
+def test_scatter_is_the_deviation_of_the_cycles() -> None:
+    rng = np.random.default_rng(5)
+    cycles = 1e4 + rng.normal(size=(12, 36))
+    scatter = Scatter()
+    for coeffs_um in cycles:
+        scatter.add(coeffs_um)
+    assert scatter.map_um() == pytest.approx(uncertainty_map_um(np.cov(cycles.T)), rel=1e-4, nan_ok=True)
+
+
+def test_one_cycle_does_not_scatter() -> None:
+    scatter = Scatter()
+    scatter.add(flat() + 1e4)
+    assert np.nanmax(scatter.map_um()) == 0.0

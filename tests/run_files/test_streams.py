@@ -11,14 +11,23 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.telemetry import FIELDS, changes, unpack
+from membrane_ctrl.model.telemetry import COLUMN, FIELDS, changes, column, unpack
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
 from membrane_ctrl.recorder.blueprint import FAULT, STATE
 from membrane_ctrl.recorder.process import THUMBNAIL_INTERVAL_S, Thumbnails
-from membrane_ctrl.recorder.rerun_streams import ShapeStreams, event_text
+from membrane_ctrl.recorder.rerun_streams import ShapeStreams
 from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.run_files.streams import DERIVED, SHAPE_STREAMS, STREAMS, overview_um
-from tests.support.rrd_reading import entities, scalars
+from membrane_ctrl.run_files.rrd_reader import read_shapes
+from membrane_ctrl.run_files.streams import (
+    DERIVED,
+    MARKS,
+    SHAPE_STREAMS,
+    STREAMS,
+    mark_lines,
+    mean_row,
+    overview_um,
+)  # fmt: skip
+from tests.support.rrd_reading import entities
 from tests.support.synthetic_run import rows_of, shape_of
 
 
@@ -28,7 +37,7 @@ def test_every_field_is_in_one_stream_and_one_only() -> None:
 
 
 def test_no_two_streams_share_an_entity() -> None:
-    paths = [stream.path for stream in (*STREAMS, *DERIVED, *SHAPE_STREAMS)]
+    paths = [stream.path for stream in (*STREAMS, *DERIVED, *SHAPE_STREAMS, *MARKS)]
     assert len(paths) == len(set(paths))
 
 
@@ -54,10 +63,38 @@ def test_codes_have_words() -> None:
     )
 
 
-def test_an_event_is_one_line() -> None:
-    event = {"time_utc": "x", "mono_s": 1.0, "kind": "state", "to": "hold", "error_um": 1 / 3, "why": None}
-    assert event_text(event) == "state: to hold, error_um 0.333333"
-    assert event_text({"kind": "end"}) == "end"
+def test_means_are_of_what_is_there() -> None:
+    rows = unpack([row.pack() for row in rows_of(0.1)]).copy()
+    rows[:, COLUMN["pump_fraction"]] = [0.1, np.nan, 0.3, np.nan, 0.5]
+    mean = mean_row(rows)
+    assert column(mean, "pump_fraction") == pytest.approx([0.3])
+    assert column(mean, "mono_s") == pytest.approx([0.04])
+    assert np.isnan(column(mean, "gas_temperature_c")).all()
+
+
+def test_lines_are_vertical_and_of_their_kind() -> None:
+    told = [
+        {"kind": "command", "command": "setpoint", "mono_s": 2.0},
+        {"kind": "command", "command": "vent", "mono_s": 3.0, "refused": "not now"},
+        {"kind": "command", "command": "resume", "mono_s": 4.0},
+        {"kind": "command", "command": "mark", "mono_s": 5.0},
+        {"kind": "command", "command": "stop", "mono_s": 6.0},
+        {"kind": "fault", "mono_s": 7.0},
+        {"kind": "fault", "mono_s": 9.0},
+        {"kind": "why", "mono_s": 8.0},
+    ]
+    found = {stream.path: (time_s, values[:, 0]) for stream, time_s, values in mark_lines(told)}
+    assert {path: sorted(set(np.round(time_s, 6))) for path, (time_s, _) in found.items()} == {
+        "/marks/setpoint": [2.0],
+        "/marks/pause": [4.0],
+        "/marks/mark": [5.0],
+        "/marks/command": [6.0],
+        "/marks/fault": [7.0, 9.0],
+    }
+    time_s, values = found["/marks/fault"]
+    assert time_s[0] == time_s[1] < time_s[2] < time_s[3]
+    assert values[0] == -values[1] < 0
+    assert np.isnan(values[2])  # no line from one fault to the next
 
 
 def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path) -> None:
@@ -67,10 +104,25 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
     for cycle in range(4):
         if cycle == 1:
             shapes.rebase(1.5)
-        shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle))
+        shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle, displacement_um=7.0 * cycle))
     recording.close()
-    _, values = scalars(tmp_path / "test-000.rrd", "/shape/sag_change")
-    assert values[:, 0] == pytest.approx([0.0, 100.0, 0.0, 100.0])
+    read = read_shapes(tmp_path / "test-000.rrd", [])
+    assert read["sag_um"] == pytest.approx([0.0, 100.0, 0.0, 100.0])
+    assert read["displacement_um"] == pytest.approx([0.0, 7.0, 0.0, 7.0])
+    assert read["sag_sigma_um"] == pytest.approx(4 * [0.1])
+
+
+def test_the_sag_of_earlier_versions_is_read(tmp_path: Path) -> None:
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    at_s = np.array([1.0, 2.0])
+    recording.scalars("/shape/zernike", at_s, np.zeros((2, 36)))
+    recording.scalars("/shape/sag_change", at_s, np.array([[1.0, 1.2, 0.8, 5.0], [2.0, 2.3, 1.7, 6.0]]))
+    recording.close()
+    read = read_shapes(tmp_path / "test-000.rrd", [])
+    assert read["sag_um"] == pytest.approx([1.0, 2.0])
+    assert read["sag_sigma_um"] == pytest.approx([0.2, 0.3])
+    assert read["displacement_um"] == pytest.approx([5.0, 6.0])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])

@@ -6,7 +6,9 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray, Column
 from membrane_ctrl.review.statistics.drift import FittedSlope, slope
-from membrane_ctrl.run_files.shapes import MAP_PX, Shapes, height_basis
+from membrane_ctrl.run_files.shapes import Shapes, height_basis
+
+MAP_PX = 128
 
 # Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper gives A, B and C
 # only in a figure).

@@ -11,11 +11,10 @@ import numpy as np
 import rerun as rr
 
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
-from membrane_ctrl.model.events import Fault, Why
-from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.model.event_words import level, sentence
+from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
-from membrane_ctrl.recorder.rerun_streams import event_text
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
@@ -145,10 +144,8 @@ class Layer:
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
         told = [e for e in run.log if not isinstance(e.event, Why) and part_s[0] <= e.mono_s <= part_s[1]]
         if told:
-            levels = ["ERROR" if isinstance(each.event, Fault) else "INFO" for each in told]
-            texts = [f"mark: {e.event.text}" if isinstance(e.event, Mark) else event_text(e.line) for e in told]
             times = np.array([each.mono_s for each in told])
-            self._log(run, "/events", times, texts, levels)
+            self._log(run, "/events", times, [sentence(e.line) for e in told], [level(e.line) for e in told])
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
             texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in seen]

@@ -227,7 +227,7 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     with _headless() as viewer:
         viewer.open(files)
         _show_tab(viewer, tab)
-        viewer.set_time("run_time", play_state="following")
+        viewer.set_time("utc", play_state="following")
         return _at_rest(viewer)
 
 

@@ -1,0 +1,88 @@
+"""Events as sentences."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+
+from membrane_ctrl.model import event_words
+from membrane_ctrl.model.event_words import level, sentence
+from membrane_ctrl.model.events import KINDS, EventLine
+
+FAULT = {
+    "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 um",
+    "cause": "the bowl is deeper than its limit", "limit": "limits.displacement_max_um", "rung": "vent",
+    "latching": True, "remedy": "check the laser against a ruler", "crc32": "0",
+}  # fmt: skip
+
+
+def test_a_fault_says_what_where_and_what_to_do() -> None:
+    assert sentence(FAULT) == (
+        "Fault over_displacement: the bowl is deeper than its limit (501.0 µm). Do: check the laser against a ruler. "
+        "Limit: limits.displacement_max_um; safe level vent"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ({"kind": "end", "exit": "done"}, "Run ended: done"),
+        ({"kind": "why", "why": "inside +-2 um"}, "Inside ±2 µm"),
+        ({"kind": "state", "state": "hold", "from": "settle", "why": ""}, "State hold, from settle"),
+        (
+            {"kind": "command", "command": "setpoint", "value": 5.0, "who": "ann", "why": "step"},
+            "Command setpoint 5 µm by ann: step",
+        ),
+        (
+            {"kind": "command", "command": "hold", "who": "ann", "refused": "not now"},
+            "Command hold by ann. Refused: not now",
+        ),
+        (
+            {"kind": "command", "command": "mark", "text": "a [b] {c}", "who": "ann"},
+            'Command mark "a [b] {c}" by ann',
+        ),
+        ({"kind": "no_claim", "message": "the board\ncannot"}, "The board cannot"),
+        (
+            {"kind": "plausibility", "liar": "nobody", "seen": "laser +1.0 um"},
+            "Laser and camera agree again (laser +1.0 µm)",
+        ),
+        # not as expected: the fields, whatever they are
+        ({"kind": "state", "to": "hold", "error_um": 1 / 3, "why": None}, "state: to hold, error_um 0.333333"),
+        ({"kind": "command", "command": "setpoint", "value": "much"}, "command: command setpoint, value much"),
+        ({"kind": "of_tomorrow"}, "of_tomorrow"),
+        ({}, "?"),
+    ],
+)
+def test_an_event_is_a_sentence(line: EventLine, said: str) -> None:
+    assert sentence(line) == said
+
+
+def test_every_sentence_is_of_a_kind_and_uses_its_keys() -> None:
+    for kind, form in event_words._SENTENCES.items():
+        known = KINDS["plausibility" if kind == "agreement" else kind]
+        keys = {key for _, key in known.keys} | {"unit"}
+        assert set(event_words._FIELD.findall(form)) <= keys, kind
+
+
+def test_every_kind_without_a_sentence_has_a_message() -> None:
+    silent = {kind for kind, cls in KINDS.items() if "message" not in {field.name for field in fields(cls)}}
+    assert silent - set(event_words._SENTENCES) <= {"alive", "recorder_done"}  # never in a run's events
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (FAULT, "ERROR"),
+        ({"kind": "acquisition", "state": "failed"}, "ERROR"),
+        ({"kind": "acquisition", "state": "retrying"}, "WARN"),
+        ({"kind": "link", "up": False}, "WARN"),
+        ({"kind": "link", "up": True}, "INFO"),
+        ({"kind": "plausibility", "liar": "laser"}, "WARN"),
+        ({"kind": "plausibility", "liar": "nobody"}, "INFO"),
+        ({"kind": "command", "command": "hold", "refused": "no"}, "WARN"),
+        ({"kind": "state"}, "INFO"),
+    ],
+)
+def test_levels(line: EventLine, expected: str) -> None:
+    assert level(line) == expected
