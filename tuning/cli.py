@@ -29,6 +29,8 @@ LimitOption = Annotated[
 ]
 ObserveOption = Annotated[str, typer.Option(help="Duration of the quiet hold, 5m to 15m.")]
 VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")]
+YesOption = Annotated[bool, typer.Option("--yes", help="Apply the proposal without asking.")]
+ChooseOption = Annotated[str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
 
@@ -38,9 +40,9 @@ _STEPS = {
     "observe": "Observe a quiet hold: laser noise and weather.",
     "design": "Compare candidates side by side and propose gains.",
     "preview": "Simulate present and proposed gains on the fitted twin.",
-    "apply": "Apply the proposed gains on trial; they revert unless `verify` keeps them.",
+    "apply": "Apply the gains that you choose on trial; they revert unless `verify` keeps them.",
     "verify": "Verify the new gains over ten minutes of hold; keep them, or revert (exit 3).",
-    "run": "Run all steps that are not done yet.",
+    "run": "Run all steps that are not done yet; shows the candidates and asks before any gains change.",
     "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
     "outer": "Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant.",
     "watch": "Watch a hold without touching it; report whether a session is due (exit 3).",
@@ -65,6 +67,8 @@ def _step(name: str) -> None:
         observe: ObserveOption = "10m",
         verify: VerifyOption = "10m",
         take_over: TakeOverOption = False,
+        yes: YesOption = False,
+        choose: ChooseOption = "",
         json: JsonOption = False,
     ) -> int:
         from membrane_ctrl.config.schema import Config
@@ -85,6 +89,8 @@ def _step(name: str) -> None:
             observe_s=parse_duration_s(observe),
             verify_s=parse_duration_s(verify),
             take_over=take_over,
+            yes=yes,
+            choose=choose,
             json=json,
         )
         return _run(name, options)

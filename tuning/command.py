@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
@@ -15,7 +16,7 @@ from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedEr
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
-from tuning import gains_file, report, session, twin_hold
+from tuning import choice, gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
 from tuning.rig import HoldRig
@@ -40,6 +41,8 @@ class TuneOptions:
     observe_s: float
     verify_s: float
     take_over: bool
+    yes: bool
+    choose: str
     json: bool
 
     @property
@@ -58,11 +61,9 @@ def author_name() -> str:
 
 def run_session(options: TuneOptions) -> int:
     """Run all steps that are not done yet and return the exit code; raises like `one_step`."""
+    choice.require_an_answer(options.yes, options.choose, known=options.session is None)
     with _session(options) as (folder, rig, progress):
-        todo = [step for step in STEPS if not folder.done(step)]
-        for number, step in enumerate(todo):
-            _begin(progress, options, step, todo[number + 1 :])
-            _do(step, folder, rig, options, progress)
+        _do_all([step for step in STEPS if not folder.done(step)], folder, rig, options, progress)
     return _concluded(folder, options)
 
 
@@ -71,15 +72,27 @@ def one_step(step: str, options: TuneOptions) -> int:
 
     Raises InputError, DeviceError or RejectedError, and then holds the mirror with the last good gains.
     """
+    if step == "apply":
+        choice.require_an_answer(options.yes, options.choose, known=options.session is None)
     if step not in _MOVES:
         folder = _folder(options, None)
         with writing(folder.path, DeviceError):
             _do(step, folder, None, options, Progress())
     else:
         with _session(options, fresh=step == "characterise" and options.session is None) as (folder, rig, progress):
-            _begin(progress, options, step, [])
-            _do(step, folder, rig, options, progress)
+            _do_all([step], folder, rig, options, progress)
     return _concluded(folder, options)
+
+
+def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneOptions, progress: Progress) -> None:
+    for number, step in enumerate(todo):
+        if step == "apply" and not choice.chosen(folder, rig, options.yes, options.choose, progress):
+            progress.say(
+                f"nothing is applied; `membrane-ctrl tune apply --session {folder.path}` applies a candidate later"
+            )
+            return
+        _begin(progress, options, step, todo[number + 1 :])
+        _do(step, folder, rig, options, progress)
 
 
 def map_pump(options: TuneOptions) -> int:
@@ -199,7 +212,8 @@ def _verify(folder: SessionFolder, rig: HoldRig, options: TuneOptions, told: Cal
     what: gains_file.What = "kept" if done.kept else "taken_back"
     reason = options.reason if done.kept else done.reason
     author = folder.head.author
-    gains_file.note(options.logs, gains_file.entry(what, folder.path.name, author, reason, done.before, done.after))
+    told_of = (folder.path.name, author, reason, done.before, done.after, session.traded(folder))
+    gains_file.note(options.logs, gains_file.entry(what, *told_of))
 
 
 def _in_a_line(step: str, folder: SessionFolder) -> str:
@@ -220,19 +234,30 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
         case "design":
             gains = gains_file.load_gains(folder.file("gains.toml"))
             return (
-                f"K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, filter "
-                f"{gains.loop.measurement_filter_s:.2f} s: {gains.predicted_std_um:.3f} um predicted, "
+                f"{_gains_words(gains.loop)}: {session.traded(folder)}; "
                 f"{gains.predicted_std_um / gains.least_std_um:.2f} of the lower bound"
             )
         case "preview":
             shown = session.preview_of(folder)
-            present, proposed = (sum(p.std_um for p in row) / len(row) for row in (shown.present, shown.proposed))
-            return f"on the fitted twin {present:.3f} um with the present gains, {proposed:.3f} um with the new ones"
+            std, peak, recovery = (
+                " -> ".join(
+                    f"{fmean(getattr(p, name) for p in row):.{digits}f}" for row in (shown.present, shown.proposed)
+                )
+                for name, digits in (("std_um", 3), ("load_peak_um", 2), ("recovery_s", 1))
+            )
+            return f"on the fitted twin std {std} um, load peak {peak} um, recovery {recovery} s"
+        case "apply":
+            loop = gains_file.load_gains(folder.file("gains.toml")).loop
+            return f"{session.traded(folder).candidate} is on trial: {_gains_words(loop)}"
         case "verify":
             done = session.verified_of(folder)
             return "kept" if done.kept else f"the previous gains are back: {done.reason}"
         case _:
             return "done"
+
+
+def _gains_words(loop: LoopConfig) -> str:
+    return f"K {loop.kp_per_s:.3f} 1/s, Ti {loop.ti_s:.2f} s, filter {loop.measurement_filter_s:.2f} s"
 
 
 def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:

@@ -6,7 +6,7 @@ or have too little margin are refused by name.
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -58,6 +58,7 @@ class GainsFile(Section):
     reason: str
     source: str  # run folder or twin, and session
     data_sha256: str
+    candidate: str = ""  # its name, if a person chose it
     predicted_std_um: Positive
     least_std_um: Positive
     plant: PlantSection
@@ -109,6 +110,35 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 
 @dataclass(frozen=True, slots=True)
+class LoopFigures:
+    """What a set of gains gives and costs, as predicted; or how well that is known (1 sigma)."""
+
+    std_um: float  # of the true centre
+    load_peak_um: float  # after a step of the leak
+    load_recovery_s: float
+    ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Traded:
+    """The name of a candidate, and the figures before and with it."""
+
+    candidate: str
+    before: LoopFigures
+    after: LoopFigures
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Standard deviation in um, load peak in um, recovery in s, Ms: each before and after."""
+        pairs = zip(astuple(self.before), astuple(self.after), (3, 2, 1, 2), strict=True)
+        return tuple(f"{before:.{digits}f} -> {after:.{digits}f}" for before, after, digits in pairs)
+
+    def __str__(self) -> str:
+        std, peak, recovery, ms = self.words
+        return f"std {std} um, load peak {peak} um, recovery {recovery} s, Ms {ms}"
+
+
+@dataclass(frozen=True, slots=True)
 class GainsEntry:
     """One line of the journal."""
 
@@ -119,11 +149,21 @@ class GainsEntry:
     reason: str
     before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
     after: LoopConfig
+    traded: Traded | None = None
 
 
-def entry(what: What, session: str, author: str, reason: str, before: LoopConfig, after: LoopConfig) -> GainsEntry:
+def entry(
+    what: What,
+    session: str,
+    author: str,
+    reason: str,
+    before: LoopConfig,
+    after: LoopConfig,
+    traded: Traded | None = None,
+) -> GainsEntry:
     """Return an entry stamped with the present time."""
-    return GainsEntry(datetime.now(UTC).isoformat(timespec="seconds"), what, session, author, reason, before, after)
+    now_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    return GainsEntry(now_utc, what, session, author, reason, before, after, traded)
 
 
 def note(logs: Path, what: GainsEntry) -> None:
@@ -167,13 +207,15 @@ def to_roll_back(logs: Path) -> GainsEntry:
 def history_table(found: list[GainsEntry]) -> str:
     """The journal as a Markdown table."""
     lines = [
-        "| time | what | session | author | K 1/s | Ti s | filter s | reason |",
-        "|---|---|---|---|---:|---:|---:|---|",
+        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std um | load peak um | recovery s "
+        "| Ms | reason |",
+        "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
     ]
     for line in found:
         loop = line.before if line.what == "rolled_back" else line.after
+        traded = (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
         lines.append(
             f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | {loop.kp_per_s:.3f} "
-            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {line.reason} |"
+            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | {line.reason} |"
         )
     return "\n".join(lines)

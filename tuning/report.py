@@ -72,19 +72,19 @@ def draw_weather(
 
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
-    """Draw all candidates: predicted standard deviation, sensitivity peak, load peak, pump activity, |S|."""
+    """Draw all candidates: predicted standard deviation, Ms, load peak, recovery, pump activity, |S|."""
     sound = [(row, row.predicted) for row in design.candidates if row.predicted is not None]
     rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
     stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
     figure = Figure(figsize=(12, 8), layout="constrained")
     (a, b, c), (d, e, f) = figure.subplots(2, 3)
-    f.remove()
     places = np.arange(len(names))
     for axes, values, title, limit in (
         (a, stds, "predicted std (um)", design.least_std_um),
         (b, [row.margins.ms for row in rows], "Ms", 1.4),
         (c, [row.load_peak_um for row in rows], "load peak (um)", math.nan),
-        (d, np.minimum(flows, 3.0), "flow std (um/s, cut at 3)", math.nan),
+        (d, np.minimum([row.load_recovery_s for row in rows], 60.0), "recovery (s, cut at 60)", math.nan),
+        (e, np.minimum(flows, 3.0), "flow std (um/s, cut at 3)", math.nan),
     ):
         colours = ["tab:green"] + ["tab:blue"] * (len(names) - 1)
         axes.barh(places, values, color=colours)
@@ -96,9 +96,9 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
     w = loop_model.frequencies(dt_s)
     for row in rows:
         size = np.abs(1 / (1 + loop_model.loop_response(row.gains, model, w, dt_s)))
-        e.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
-    e.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
-    e.legend(loc="best", fontsize=6)
+        f.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
+    f.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
+    f.legend(loc="best", fontsize=6)
     _save(path, figure)
 
 
@@ -213,16 +213,18 @@ def _designed(folder: SessionFolder) -> list[str]:
     if not folder.done("design"):
         return parts
     design, gains = session.design_of(folder), gains_file.load_gains(folder.file("gains.toml"))
+    traded, by = session.traded(folder), "chosen" if gains.candidate else "proposed"
     lines = folder.candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     parts += [
         "<h2>Candidates</h2>",
         _table(cells[0], cells[2:]),
         _image(folder, "candidates.png"),
-        f"<p>Proposed: K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, filter "
-        f"{gains.loop.measurement_filter_s:.2f} s; {gains.predicted_std_um:.3f} um predicted, lower bound "
-        f"{gains.least_std_um:.3f} um. Over plants drawn from the fit: Ms {design.robustness.ms_p95:.2f}, std "
-        f"{design.robustness.std_p95_um:.3f} um at 95 %, {design.robustness.stable_fraction:.0%} stable.</p>",
+        f"<p>{html.escape(traded.candidate)} is {by}: K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, "
+        f"filter {gains.loop.measurement_filter_s:.2f} s. Present and new gains: {html.escape(str(traded))}. Lower "
+        f"bound of the std: {gains.least_std_um:.3f} um. The proposal over plants drawn from the fit: Ms "
+        f"{design.robustness.ms_p95:.2f}, std {design.robustness.std_p95_um:.3f} um at 95 %, "
+        f"{design.robustness.stable_fraction:.0%} stable.</p>",
     ]
     if folder.done("preview"):
         shown = session.preview_of(folder)

@@ -192,6 +192,11 @@ class HoldRig:
         if loop != self.loop:
             self.set_gains(loop, "back to the last good gains")
 
+    def catch_up(self) -> None:
+        """Discard the ticks so far: while a person thinks, nothing is recorded."""
+        self._take()
+        self._rows.clear()
+
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
         """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the flow."""
         flows: list[float] = []

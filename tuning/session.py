@@ -14,10 +14,11 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.control.experiments import machine, pump_map
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
-from tuning.gains_file import GainsFile, PlantSection, for_hold, load_gains, require_sound, save_gains
-from tuning.identification import characterise, identify, records
+from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
+from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel, observe
-from tuning.proposal import design, prediction, verify
+from tuning.proposal import design, prediction, trade, verify
+from tuning.proposal.candidates import Demands
 from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
@@ -162,7 +163,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         plant=PlantSection.of(found.identified),
         loop=made.loop,
     )
-    files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
+    files.write_text_atomic(files.users(session.file("candidates.md")), trade.table(made.candidates) + "\n")
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     folder.write(session.file("proposal.json"), kept)
     save_gains(session.file("gains.toml"), gains)
@@ -172,6 +173,48 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
 def design_of(session: folder.SessionFolder) -> Design:
     """The candidates."""
     return session.result("design", "proposal.json", Design)
+
+
+EDITED = "edited"  # gains of a file edited by hand
+
+
+def offered(session: folder.SessionFolder) -> tuple[tuple[design.Candidate, ...], design.Candidate]:
+    """The candidates, and the one in `gains.toml`, which is a further one if that was edited by hand."""
+    rows, loop = design_of(session).candidates, load_gains(session.file("gains.toml")).loop
+    gains = loop_model.Gains.of(loop)
+    for row in rows:
+        if row.gains == gains:
+            return rows, row
+    model = found_of(session).identified.model
+    edited = design.candidate(EDITED, gains, model, disturbance_of(session), loop, Demands())
+    return (*rows, edited), edited
+
+
+def choose(session: folder.SessionFolder, name: str) -> None:
+    """Put a candidate into `gains.toml`. Raises InputError if it is unknown or must not be applied."""
+    rows, now = offered(session)
+    known = {row.name: row for row in rows if row.name != design.PRESENT}
+    if name not in known:
+        raise errors.InputError(f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}")
+    row = known[name]
+    if why := trade.refusal(row):
+        raise errors.InputError(f"{name}: is not applied: {why}")
+    assert row.predicted is not None  # else refused
+    path = session.file("gains.toml")
+    gains = load_gains(path)
+    chosen = {"candidate": name, "predicted_std_um": row.predicted.std_um}
+    save_gains(path, gains.model_copy(update={**chosen, "loop": row.gains.applied_to(gains.loop)}))
+    if row is not now and session.done("preview"):
+        preview_step(session)
+
+
+def traded(session: folder.SessionFolder) -> Traded:
+    """What the gains in `gains.toml` give and cost."""
+    rows, now = offered(session)
+    present = [row.figures for row in rows if row.name == design.PRESENT]
+    if not present:
+        raise errors.InputError(f"{session.path}: proposal.json is damaged; run design again")
+    return Traded(now.name, present[0], now.figures)
 
 
 def preview_step(session: folder.SessionFolder) -> Previewed:
@@ -228,8 +271,10 @@ def verify_step(
     """Hold with the new gains and judge them in stages; keep them, or restore the old ones at once."""
     session.require("apply")
     after, before = checked_gains(session), session.head.before
+    accepted = load_gains(session.file("gains.toml")).candidate == offered(session)[1].name
     session.begin("verify")
-    trial = verify.VerificationTrial(found_of(session).identified.model, disturbance_of(session), before, after)
+    model, weather = found_of(session).identified.model, disturbance_of(session)
+    trial = verify.VerificationTrial(model, weather, before, after, accepted)
     trial_s = verify.settle_s(after) + stages[-1][0] + _SPARE_S
     rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verify.Stage] = []

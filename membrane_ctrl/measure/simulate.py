@@ -7,7 +7,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spec
 
 
@@ -100,4 +100,4 @@ def _progress(sets: int) -> Callable[[int], None] | None:
     """Count the sets in one line, on a terminal only."""
     if not sys.stderr.isatty():
         return None
-    return lambda done: print(f"\r{done} of {sets} sets", end="" if done < sets else "\n", file=sys.stderr)
+    return lambda done: terminal.live_line(f"{done} of {sets} sets", "" if done < sets else "\n")

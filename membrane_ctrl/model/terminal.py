@@ -55,6 +55,13 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
     return made
 
 
+def live_line(text: str, end: str = "") -> None:
+    """Replace the last line of stderr, a terminal, by a text."""
+    stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # `_Text` would escape what moves the cursor
+    stream.write(f"\r\033[K{one_line(text)}{end}")
+    stream.flush()
+
+
 def counted(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
     """Yield the items, with a progress bar on stderr if that is a terminal."""
     from rich.progress import track

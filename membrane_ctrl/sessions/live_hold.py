@@ -16,7 +16,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.run_files import events
@@ -163,6 +163,7 @@ class Progress:
         self._live = sys.stderr.isatty()
         self._step, self._planned_s, self._after_s = "", 0.0, 0.0
         self._done_s = self._shown_s = 0.0
+        self._asking = False
         self.interrupted = False
 
     def begin(self, step: str, planned_s: float, after_s: float) -> None:
@@ -184,17 +185,28 @@ class Progress:
         line = (
             f"{self._step}: {_clock(self._done_s)}, {_clock(left_s)} left, session {_clock(left_s + self._after_s)}"
         )
-        print(f"\r\033[K{line}" if self._live else line, end="" if self._live else "\n", file=sys.stderr, flush=True)
+        terminal.live_line(line) if self._live else self.say(line)
 
     def say(self, line: str) -> None:
         """Print a permanent line."""
-        print(f"\r\033[K{line}" if self._live else line, file=sys.stderr, flush=True)
+        terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
+
+    def ask(self, question: str) -> str:
+        """Ask on the terminal; the answer is empty at the end of the input. Ctrl-C interrupts at once."""
+        print(f"{question} ", end="", file=sys.stderr, flush=True)
+        self._asking = True
+        try:
+            return sys.stdin.readline().strip()
+        finally:
+            self._asking = False
 
     @contextlib.contextmanager
     def catching(self) -> Iterator[None]:
         """Note Ctrl-C and SIGTERM, and raise them at the next tick, not in the middle of a command."""
 
         def note(number: int, frame: FrameType | None) -> None:
+            if self._asking:
+                raise KeyboardInterrupt
             self.interrupted = True
 
         former = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -87,7 +87,7 @@ def good_sofast(folder: Path) -> None:
 def good_tuning(folder: Path) -> None:
     """Run folders with the journal of a tuning session, all steps of it done on the twin: 30 s of computing."""
     times = ("--observe", "5m", "--verify", "5m")
-    assert run(["tune", "run", "--twin", "--logs", str(folder), *times]) in (0, 3)
+    assert run(["tune", "run", "--twin", "--yes", "--logs", str(folder), *times]) in (0, 3)
     (session,) = (folder / "tuning").glob("2*")
     session.rename(session.with_name(TUNING))
 

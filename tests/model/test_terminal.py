@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.model.terminal import Plain, counted, one_line, only_text, plain, table_console
+from membrane_ctrl.model.terminal import Plain, counted, live_line, one_line, only_text, plain, table_console
 
 # title, bell, carriage return, backspace, C1 of one byte, a line drawn backwards, an invisible tag, half a pair, NUL
 HOSTILE = "a\x1b]0;owned\x07\r\b\x9b2J\u202ebad\u2066\U000e0041\ud800\u2028\x00\x7fz"
@@ -79,6 +79,15 @@ def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(monk
     assert "\\u001b[2K" not in sent
     for letter in ("\x1b]", "\x9b", "\x07", "\b", "\u202e"):
         assert letter not in sent
+
+
+def test_a_live_line_replaces_itself_and_its_text_moves_no_cursor(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with only_text():
+        live_line(f"1 of 2{HOSTILE}")
+        live_line("done", "\n")
+    assert terminal.getvalue() == f"\r\x1b[K1 of 2{one_line(HOSTILE)}\r\x1b[Kdone\n"
 
 
 def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:

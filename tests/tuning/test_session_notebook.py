@@ -27,7 +27,7 @@ def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]
     for number, source in enumerate(code()):
         exec(compile(source, f"cell {number}", "exec"), space)
     said = capsys.readouterr().out
-    assert "Ziegler-Nichols" in said
+    assert "ziegler-nichols" in said
     assert space["done"].quality.verdict in ("ok", "degraded")
     assert space["stage"].reason == ""
     assert space["rig"].loop == space["proposal"].loop

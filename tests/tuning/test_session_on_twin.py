@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
+import signal
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,8 @@ from tuning import session
 from tuning.comparison import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
+from tuning.proposal.design import NAMES
+from tuning.proposal.trade import against
 from tuning.rig import HoldRig
 from tuning.twin_hold import TwinHold
 
@@ -49,7 +54,10 @@ def tune_twin(logs: Path, *words: str, config: str = CONFIG) -> int:
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs with one complete session in them."""
     folder = tmp_path_factory.mktemp("logs")
-    assert tune_twin(folder, "run", "--name", "first", "--author", "eve", "--reason", "new film", *TIMES) == Exit.DONE
+    assert (
+        tune_twin(folder, "run", "--name", "first", "--author", "eve", "--reason", "new film", "--yes", *TIMES)
+        == Exit.DONE
+    )
     return folder
 
 
@@ -81,7 +89,7 @@ def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder)
     text = done.file("report.html").read_text(encoding="utf-8")
     assert text.count("data:image/png;base64,") == 4
     assert "://" not in text  # base64 may spell "http" by chance
-    for word in ("Ziegler-Nichols", "eve", "Verification", "kept"):
+    for word in ("ziegler-nichols", "eve", "Verification", "kept"):
         assert word in text
     assert done.file("session.rrd").stat().st_size > 100_000
 
@@ -158,7 +166,7 @@ def test_gains_that_are_worse_are_taken_back_by_themselves(done: SessionFolder, 
     """Sluggish gains, with margins that nothing can be said against."""
     edited(done, kp_per_s=0.1, ti_s=60.0)
     words = ("apply", "verify")
-    codes = [tune_twin(tmp_path, word, "--session", str(done.path), *TIMES) for word in words]
+    codes = [tune_twin(tmp_path, word, "--session", str(done.path), "--yes", *TIMES) for word in words]
     assert codes == [Exit.DONE, Exit.REJECTED]
     verified = session.verified_of(done)
     assert not verified.kept
@@ -222,7 +230,13 @@ def test_history_rollback_and_comparison(
     assert tune_twin(copied, "rollback") == Exit.BAD_INPUT
     capsys.readouterr()
     assert command_line(["tune", "history", "--logs", str(copied), "--json"]) == Exit.DONE
-    assert json.loads(capsys.readouterr().out)[1]["reason"] == "did not like it"
+    kept, back = json.loads(capsys.readouterr().out)
+    assert back["reason"] == "did not like it"
+    assert kept["traded"]["candidate"] == "least-variance"
+    assert kept["traded"]["before"]["std_um"] > kept["traded"]["after"]["std_um"]
+    assert f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> " in journal.history_table(
+        journal.entries(copied)
+    )
 
 
 def test_a_comparison_crosses_gains_and_benches(done: SessionFolder, tmp_path: Path) -> None:
@@ -242,6 +256,113 @@ def test_rolling_back_sets_the_gains_of_before(logs: Path, tmp_path: Path, monke
     for _ in range(12):
         Kept.last.news()
     assert kp_of(Kept.last) == pytest.approx(0.61, rel=0.02)
+
+
+class Terminal(io.StringIO):
+    """A terminal at which a person types these answers; `!` is Ctrl-C."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self, size: int | None = -1, /) -> str:
+        answer = super().readline()
+        if answer == "!\n":
+            signal.raise_signal(signal.SIGINT)
+        return answer
+
+
+def asked(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers: str, *words: str
+) -> tuple[int, float]:
+    """Exit code of `tune apply` answered so, and the gain that then holds the mirror."""
+    monkeypatch.setattr(sys, "stdin", Terminal(answers))
+    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
+    done.begin("apply")
+    code = tune_twin(tmp_path, "apply", "--session", str(done.path), *words)
+    for _ in range(20):
+        Kept.last.news()
+    assert Kept.last.rows[-1].state == State.HOLD
+    return code, kp_of(Kept.last)
+
+
+def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, kp_per_s = asked(done, tmp_path, monkeypatch, "fast\nziegler-nichols\npresent\nsimc-slow\n")
+    chosen = next(row for row in session.design_of(done).candidates if row.name == "simc-slow")
+    gains = load_gains(done.file("gains.toml"))
+    assert code == Exit.DONE
+    assert kp_per_s == pytest.approx(chosen.gains.kp_per_s, rel=0.02)
+    assert (gains.candidate, gains.loop.kp_per_s) == ("simc-slow", chosen.gains.kp_per_s)
+    assert session.preview_of(done).proposed[0].load_peak_um == pytest.approx(chosen.load_peak_um, rel=0.05)
+    said = capsys.readouterr().err
+    assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in said] == ["fast", "present"]
+    assert "ziegler-nichols: is not applied: Ms" in said
+    shown = [line.split()[1] for line in said.splitlines() if line.startswith("│ ") and line.split()[1] != "│"]
+    assert shown == ["present", "least-variance", *[name for name in NAMES if name in shown[2:]]]
+    assert "in force" in said
+    assert "simc-slow is on trial" in said
+    assert "simc-slow is chosen" in done.file("report.html").read_text()
+
+
+@pytest.mark.parametrize(("answers", "code"), [("\n", Exit.DONE), ("", Exit.DONE), ("!\n", Exit.INTERRUPTED)])
+def test_no_answer_applies_nothing(
+    done: SessionFolder,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answers: str,
+    code: Exit,
+) -> None:
+    before = done.file("gains.toml").read_bytes()
+    assert asked(done, tmp_path, monkeypatch, answers) == (
+        code,
+        pytest.approx(done.head.before.kp_per_s, rel=0.02),
+    )
+    assert done.file("gains.toml").read_bytes() == before
+    assert not done.done("apply")
+    said = capsys.readouterr().err
+    assert ("nothing is applied; `membrane-ctrl tune apply" in said) == (code == Exit.DONE)
+
+
+@pytest.mark.parametrize("name", ["fast", "ziegler-nichols", "present"])
+def test_a_refused_name_applies_nothing(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    code, kp_per_s = asked(done, tmp_path, monkeypatch, "simc\n", "--choose", name)
+    assert code == Exit.BAD_INPUT
+    assert kp_per_s == pytest.approx(done.head.before.kp_per_s, rel=0.02)
+    assert not done.done("apply")
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [((), "add --yes (the proposal) or --choose NAME"), (("--choose", "fast"), "--choose fast: not a candidate")],
+)
+@pytest.mark.parametrize("step", ["run", "apply"])
+def test_gains_that_nobody_can_choose_are_refused_before_anything_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], step: str, words: tuple[str, ...], reason: str
+) -> None:
+    assert tune_twin(tmp_path, step, *words) == Exit.BAD_INPUT
+    assert reason in capsys.readouterr().err
+    assert not (tmp_path / "tuning").exists()
+
+
+def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
+    assert session.offered(done)[1].name == "least-variance"
+    edited(done, kp_per_s=0.2)
+    rows, now = session.offered(done)
+    assert (now.name, now.gains.kp_per_s, len(rows)) == ("edited", 0.2, 1 + len(session.design_of(done).candidates))
+    assert "worse: " in against(now, next(row for row in rows if row.name == "present"))
+
+
+def test_candidates_of_earlier_versions_can_be_read(done: SessionFolder) -> None:
+    path = done.file("proposal.json")
+    kept = json.loads(path.read_text())
+    for row in kept["candidates"]:
+        del row["sigma"]
+    path.write_text(json.dumps(kept))
+    assert session.offered(done)[1].sigma is None
 
 
 def test_margins_of_what_is_kept(done: SessionFolder) -> None:

@@ -65,6 +65,17 @@ def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> Non
     assert "times that of the previous gains" in stage.reason
 
 
+@pytest.mark.parametrize(("kp_per_s", "reason"), [(0.1, ""), (0.03, "times that of the previous gains")])
+def test_a_deviation_that_was_predicted_and_accepted_is_no_failure(kp_per_s: float, reason: str) -> None:
+    """Gains chosen knowing what they cost; those that cost more than was predicted still fail."""
+    chosen = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
+    record, _ = held(LOOP.model_copy(update={"kp_per_s": kp_per_s, "ti_s": 60.0}))
+    stage = look(record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, LOOP, chosen, accepted=True), 1.1)
+    assert stage.growth > 1.1
+    assert reason in stage.reason
+    assert bool(stage.reason) == bool(reason)
+
+
 def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     """Gain and delay that have grown since: the model is content, the spectrum is not."""
     loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})

@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
-from membrane_ctrl.config.schema import LoopConfig, TwinConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
-from tuning.identification.loop_model import Gains, PlantModel, margins, sensitivity_peak
+from tuning.identification.loop_model import RECOVERED_UM, Gains, PlantModel, load_step, margins, sensitivity_peak
 from tuning.proposal.candidates import (
-    RECOVERED_UM,
     Demands,
     amigo,
     lambda_tuned,
     least_variance,
     load_peak_um,
-    load_recovery_s,
     max_ki,
     simc,
 )
+from tuning.proposal.design import designs, preview
 from tuning.proposal.prediction import least_std_um, predict
 
 DT_S = 1e-3
@@ -83,25 +82,49 @@ def test_max_ki_sits_on_its_sensitivity_and_beats_simc() -> None:
 
 
 @pytest.mark.parametrize("ti_s", [1.0, 4.0, 30.0])
-def test_load_peak_against_simulation(ti_s: float) -> None:
-    """Without delay the formula is exact."""
+def test_a_load_step_against_simulation(ti_s: float) -> None:
+    """Without delay the bound is exact, too."""
     model = PlantModel(0.8, 0.0, 0.0, 1.0)
     gains = Gains(1.0, ti_s)
     t = np.linspace(0, 60, 6001)
     system = control.tf([1.0, 0.0], [1.0, 0.8, 0.8 / ti_s])
     _, y = control.step_response(0.6 * system, t)
+    found = load_step(gains, model, 0.6, 1e-9)
+    assert found.peak_um == pytest.approx(float(np.max(y)), rel=0.01)
     assert load_peak_um(gains, model, 0.6) == pytest.approx(float(np.max(y)), rel=0.01)
     assert RECOVERED_UM == 0.5
     last_s = float(t[np.flatnonzero(np.abs(y) > 0.5)[-1]]) if np.max(np.abs(y)) > 0.5 else 0.0
-    assert load_recovery_s(gains, model, 0.6) == pytest.approx(last_s, abs=0.05)
+    assert found.recovery_s == pytest.approx(last_s, abs=0.1)
+
+
+def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() -> None:
+    loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+    calm = DisturbanceModel(Noise(1e-3, 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.02), None, None)
+    held = preview(loop, PumpConfig(), PUMP, calm, duration_s=1.0)
+    found = load_step(Gains.of(loop), PUMP, 0.6, 0.02)
+    assert found.peak_um == pytest.approx(held.load_peak_um, rel=0.02)
+    assert found.recovery_s == pytest.approx(held.recovery_s, abs=0.2)
+    assert found.peak_um < load_peak_um(Gains.of(loop), PUMP, 0.6) < 1.5 * found.peak_um
 
 
 def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
     """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 um after 4.3 s; without gain never."""
     model = PlantModel(1.0, 0.0, 0.0, 1.0)
-    assert load_recovery_s(Gains(1.0, 4.0), model, 1.0) == pytest.approx(4.31, abs=0.05)
-    assert load_recovery_s(Gains(1e-6, 1e6), model, 1.0) == math.inf
-    assert load_recovery_s(Gains(20.0, 0.1), model, 1.0) == 0.0
+    assert load_step(Gains(1.0, 4.0), model, 1.0, 1e-9).recovery_s == pytest.approx(4.31, abs=0.1)
+    assert load_step(Gains(1e-6, 1e6), model, 1.0, 1e-9).recovery_s == math.inf
+    assert load_step(Gains(20.0, 0.1), model, 1.0, 1e-9).recovery_s == 0.0
+
+
+def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
+    """The designs that keep the present loop's answer, and nothing worse in it."""
+    loop = LoopConfig()
+    named = designs(PUMP, typical(loop), loop, Demands())
+    present, kept = (load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"]))
+    assert kept.peak_um <= 1.01 * present.peak_um
+    assert kept.recovery_s <= present.recovery_s + 0.1
+    stds = [predict(gains, PUMP, typical(loop), loop).std_um for gains in (Gains.of(loop), named["same-load"])]
+    assert stds[1] < stds[0]
+    assert "same-load" not in designs(PUMP, typical(loop), loop.model_copy(update={"kp_per_s": 0.05}), Demands())
 
 
 def typical(loop: LoopConfig) -> DisturbanceModel:

@@ -14,8 +14,9 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
-from tuning.proposal.design import ModelBench, RefusedError, preview, propose, table
+from tuning.proposal.design import NAMES, PRESENT, ModelBench, RefusedError, preview, propose
 from tuning.proposal.prediction import robustness, sampled_plants
+from tuning.proposal.trade import table
 from tuning.rig import Rig
 
 RATIO_MAX = {
@@ -73,6 +74,7 @@ def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # typ
     found, weather, loop = designed
     proposal = propose(found, weather, loop, PumpConfig(), FitQuality("ok", ()))
     assert proposal.chosen is proposal.candidates[0]
+    assert {row.name for row in proposal.candidates} <= {*NAMES, PRESENT}
     assert proposal.robustness.stable_fraction == 1.0
     assert proposal.robustness.ms_p95 < 1.6
     assert proposal.loop.kp_per_s == proposal.chosen.gains.kp_per_s
@@ -80,7 +82,7 @@ def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # typ
     text = table(proposal.candidates)
     assert len(text.splitlines()) == 2 + len(proposal.candidates)
     assert len({line.count("|") for line in text.splitlines()}) == 1
-    assert "Ziegler-Nichols" in text
+    assert "ziegler-nichols" in text
 
 
 def test_refused_data_are_not_designed_on(designed) -> None:  # type: ignore[no-untyped-def]

@@ -92,6 +92,10 @@ class Gains:
         """Gains of a configured loop."""
         return cls(loop.kp_per_s, loop.ti_s, loop.td_s, loop.measurement_filter_s)
 
+    def rounded(self) -> "Gains":
+        """To four digits: more mean nothing, and people copy them."""
+        return Gains(*(float(f"{value:.4g}") for value in (self.kp_per_s, self.ti_s, self.td_s, self.filter_s)))
+
     def applied_to(self, loop: LoopConfig) -> LoopConfig:
         """The loop with these gains, validated. Raises pydantic.ValidationError outside the permitted range."""
         times = {"ti_s": self.ti_s, "td_s": self.td_s, "measurement_filter_s": self.filter_s}
@@ -171,3 +175,28 @@ def sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
     """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
     response = loop_response(gains, model, frequencies(dt_s), dt_s)
     return float(np.max(1 / np.abs(1 + response))) if _is_stable(response) else math.inf
+
+
+# The loop's answer to a step of the leak.
+
+RECOVERED_UM = 0.5  # a load step is over when the centre stays this near, the limit for a mean of 60 s
+_LOOK_S, _LOOKS = 0.04, 2**14  # 655 s, of which the first half is used: the transform takes the answer as periodic
+
+
+@dataclass(frozen=True, slots=True)
+class LoadStep:
+    """After a step of the leak: furthest excursion, and time until the centre stays within `RECOVERED_UM`."""
+
+    peak_um: float
+    recovery_s: float  # infinite if longer than five minutes
+
+
+def load_step(gains: Gains, model: PlantModel, step_um_per_s: float, dt_s: float) -> LoadStep:
+    """The exact answer of a stable loop with its delay: D / s^2 / (1 + L), transformed into time."""
+    w: Series = np.asarray(2 * np.pi * np.fft.rfftfreq(_LOOKS, _LOOK_S), dtype=float)
+    w[0] = _SLOWEST_RAD_PER_S  # L has two integrators: the answer is finite there
+    answer = -step_um_per_s / w**2 / (1 + loop_response(gains, model, w, dt_s))
+    away_um = np.abs(np.fft.irfft(answer, _LOOKS)[: _LOOKS // 2]) / _LOOK_S
+    away = np.flatnonzero(away_um > RECOVERED_UM)
+    over_s = (int(away[-1]) + 1) * _LOOK_S if away.size else 0.0
+    return LoadStep(float(away_um.max()), over_s if over_s < _LOOKS // 2 * _LOOK_S else math.inf)

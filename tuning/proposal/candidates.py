@@ -4,7 +4,6 @@ All treat lags as dead time (delay = theta + T + filter + half a sample): the ru
 delay, and the pump's lag of a tenth of the loop's time constant does not justify a D term.
 """
 
-import cmath
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,9 +21,8 @@ _FILTERS_S = (0.03, 0.05, 0.1, 0.2, 0.4)
 # Bounds of the search in K times delay and Ti over delay.
 _GAIN_RANGE = (0.01, 1.0)
 _TI_RANGE = (2.0, 400.0)
-RECOVERED_UM = 0.5  # a load step is over when the centre stays this near, the limit for a mean of 60 s
-_LONGEST_S, _LOOK_S = 600.0, 0.02  # duration and step of the search for the recovery
 _STEEP = 1e3  # violating a demand costs more than any variance
+_SHARE_MOST = 100.0  # finite, so that the search knows its way back
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +35,8 @@ class Demands:
     load_step_um_per_s: float = 0.6
     load_peak_um: float = 2.0
     recovery_s: float = 60.0  # three integral times at most
+    # A further demand: as good an answer to that step as this one
+    as_good_as: loop_model.LoadStep | None = None
     # Standard deviations of the feedback's flow between the holding flow and zero, and of its change per tick within
     # the rate limit: beyond, the limits clip the noise on one side and leave a bias
     pump_sigmas: float = 1.7
@@ -46,7 +46,9 @@ class Demands:
 
 
 def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
-    """Largest excursion after a step of the leak; the loop's delay counts as time without response.
+    """Bound on the largest excursion after a step of the leak: the loop's delay counts as time without response.
+
+    For searches: `loop_model.load_step` is exact, smaller, and takes longer.
 
     y'' + k K y' + k K / Ti y = D delta(t): a step D of the speed peaks at
     D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is back to 0.
@@ -60,24 +62,6 @@ def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_
         angle = math.acosh(max(zeta, 1 + 1e-9))
         peak = math.exp(-zeta / math.sinh(angle) * angle)
     return step_um_per_s * (peak / natural + model.delay_s + gains.filter_s)
-
-
-def load_recovery_s(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
-    """Time after a step of the leak until the centre stays within `RECOVERED_UM`; infinite if it never does.
-
-    The solution of the equation of `load_peak_um`, D (exp(r1 t) - exp(r2 t)) / (r1 - r2) with its roots r1 and r2,
-    starting after the loop's delay.
-    """
-    speed_per_s, stiffness = model.gain * gains.kp_per_s, model.gain * gains.kp_per_s / gains.ti_s
-    root = cmath.sqrt(speed_per_s**2 - 4 * stiffness) or 1e-9  # the limit of a double root, to nine digits
-    time_s = np.arange(0.0, _LONGEST_S, _LOOK_S)
-    slow, fast = (np.exp((sign * root - speed_per_s) / 2 * time_s) for sign in (1, -1))
-    away_um = step_um_per_s * ((slow - fast) / root).real
-    away = np.flatnonzero(np.abs(away_um) > RECOVERED_UM)
-    if away.size == 0:
-        return 0.0
-    over_s = float(time_s[away[-1]]) + _LOOK_S + model.delay_s + gains.filter_s
-    return over_s if over_s < _LONGEST_S else math.inf
 
 
 def effective_delay_s(model: loop_model.PlantModel, dt_s: float, filter_s: float) -> float:
@@ -136,7 +120,12 @@ def least_variance(
         jump = demands.pump_sigmas * found.flow_step_std_um_per_s / (loop.flow_rate_limit_um_per_s2 * dt_s)
         peak = load_peak_um(gains, model, demands.load_step_um_per_s) / demands.load_peak_um
         slow = 3 * gains.ti_s / demands.recovery_s
-        broken = sum(max(0.0, share - 1) for share in (demands.pump_sigmas * activity, jump, peak, slow))
+        shares = [demands.pump_sigmas * activity, jump, peak, slow]
+        if demands.as_good_as is not None:
+            answer = loop_model.load_step(gains, model, demands.load_step_um_per_s, dt_s)
+            shares += [answer.peak_um / demands.as_good_as.peak_um]
+            shares += [answer.recovery_s / max(demands.as_good_as.recovery_s, dt_s)]
+        broken = sum(max(0.0, min(share, _SHARE_MOST) - 1) for share in shares)
         return math.log(found.std_um) + demands.activity_weight * activity**2 + 10 * broken
 
     starts = (simc(model, dt_s, filter_s, 1.2) for filter_s in _FILTERS_S if filter_s >= dt_s)

@@ -8,10 +8,11 @@ import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
+from tuning.gains_file import LoopFigures
 from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal import candidates as rules
-from tuning.proposal.prediction import Predicted, Robustness, least_std_um, predict, robustness
+from tuning.proposal import prediction
 from tuning.rig import Rig
 
 # The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.
@@ -120,7 +121,7 @@ def preview(
     calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
     answer_um = _held(loop, pump, model, stepped, 120.0)
-    away = np.flatnonzero(np.abs(answer_um) > rules.RECOVERED_UM)
+    away = np.flatnonzero(np.abs(answer_um) > loop_model.RECOVERED_UM)
     return Preview(
         std_um=float(true_um.std()),
         bias_um=-float(true_um.mean()),
@@ -141,6 +142,7 @@ def _held(
 # The Ziegler-Nichols relay on this loop sees a limit cycle where the phase is -180 deg, w d = pi / 2:
 # Ku = pi / (2 k d), Tu = 4 d. Noise makes theirs even larger.
 _RULE_FILTER_S = 0.2  # for rules that do not choose a filter, against the laser's noise
+_PLANTS = 40  # drawn from the fit, for each candidate's error bars: 1 sigma to a tenth
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,11 +152,18 @@ class Candidate:
     name: str
     gains: loop_model.Gains
     margins: loop_model.Margins
-    predicted: Predicted | None  # None for an unstable loop
+    predicted: prediction.Predicted | None  # None for an unstable loop
     ratio: float  # predicted standard deviation over the least possible
-    # After the demanded step of the leak, by formula: largest excursion, and duration
+    # After the demanded step of the leak: largest excursion, and duration
     load_peak_um: float
     load_recovery_s: float
+    sigma: LoopFigures | None = None  # of the figures, from the fit's covariance
+
+    @property
+    def figures(self) -> LoopFigures:
+        """What is compared with the other candidates."""
+        std_um = self.predicted.std_um if self.predicted is not None else math.inf
+        return LoopFigures(std_um, self.load_peak_um, self.load_recovery_s, self.margins.ms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +175,7 @@ class Proposal:
     candidates: tuple[Candidate, ...]  # including the chosen one and the present gains
     least_std_um: float  # the lower bound
     preview: Preview  # of the chosen one on the fitted twin
-    robustness: Robustness
+    robustness: prediction.Robustness
 
 
 class RefusedError(Exception):
@@ -180,7 +189,8 @@ def feedforward_settings(loop: LoopConfig, disturbance: DisturbanceModel) -> Loo
         changed["barometer_gain_um_per_pa"] = disturbance.barometer.agreed(loop.barometer_gain_um_per_pa)
     if disturbance.air is not None:
         changed["temperature_gain_um_per_k"] = disturbance.air.agreed(loop.temperature_gain_um_per_k)
-    return LoopConfig.model_validate(loop.model_dump() | changed)
+    rounded = {name: float(f"{value:.4g}") for name, value in changed.items()}
+    return LoopConfig.model_validate(loop.model_dump() | rounded)
 
 
 def relay_ultimate(model: loop_model.PlantModel, dt_s: float) -> tuple[float, float]:
@@ -199,33 +209,42 @@ def candidate(
 ) -> Candidate:
     """One row."""
     found = loop_model.margins(gains, model, disturbance.rest.dt_s)
-    predicted = predict(gains, model, disturbance, loop) if found.stable else None
-    ratio = predicted.std_um / least_std_um(model, disturbance, loop) if predicted is not None else math.inf
-    step_um_per_s = demands.load_step_um_per_s
-    peak_um, over_s = (
-        rules.load_peak_um(gains, model, step_um_per_s),
-        rules.load_recovery_s(gains, model, step_um_per_s),
+    predicted = prediction.predict(gains, model, disturbance, loop) if found.stable else None
+    ratio = (
+        predicted.std_um / prediction.least_std_um(model, disturbance, loop) if predicted is not None else math.inf
     )
-    return Candidate(name, gains, found, predicted, ratio, peak_um, over_s)
+    answer = loop_model.load_step(gains, model, demands.load_step_um_per_s, disturbance.rest.dt_s)
+    return Candidate(name, gains, found, predicted, ratio, answer.peak_um, answer.recovery_s)
 
 
-def candidates(
+# What `tune run --choose` accepts; `SAME_LOAD` is there if the proposal answers a step of the leak worse than the
+# present gains.
+PRESENT, SAME_LOAD = "present", "same-load"
+NAMES = ("least-variance", SAME_LOAD, "simc", "simc-slow", "amigo", "lambda", "max-ki", "ziegler-nichols")
+
+
+def designs(
     model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, demands: rules.Demands
-) -> tuple[Candidate, ...]:
-    """All candidates, the proposed one first."""
+) -> dict[str, loop_model.Gains]:
+    """Gains by the name of their design (`NAMES`), the proposed ones first."""
     dt_s, filter_s = disturbance.rest.dt_s, _RULE_FILTER_S
     delay_s = rules.effective_delay_s(model, dt_s, filter_s)
-    named = {
-        f"least variance, Ms <= {demands.ms:g}": rules.least_variance(model, disturbance, loop, demands),
-        "present": loop_model.Gains.of(loop),
-        "SIMC, tc = delay": rules.simc(model, dt_s, filter_s),
-        "SIMC, tc = 4 delays": rules.simc(model, dt_s, filter_s, 4 * delay_s),
-        "AMIGO": rules.amigo(model, dt_s, filter_s),
-        "lambda = 3 delays": rules.lambda_tuned(model, dt_s, filter_s),
-        f"max ki, Ms <= {demands.ms:g}": rules.max_ki(model, dt_s, filter_s, demands.ms),
-        "Ziegler-Nichols": rules.ziegler_nichols(*relay_ultimate(model, dt_s)),
+    found = {"least-variance": rules.least_variance(model, disturbance, loop, demands)}
+    step_um_per_s, present = demands.load_step_um_per_s, loop_model.Gains.of(loop)
+    if math.isfinite(loop_model.sensitivity_peak(present, model, dt_s)):
+        answer = loop_model.load_step(present, model, step_um_per_s, dt_s)
+        if loop_model.load_step(found["least-variance"], model, step_um_per_s, dt_s).peak_um > answer.peak_um:
+            kept = replace(demands, as_good_as=answer)
+            found[SAME_LOAD] = rules.least_variance(model, disturbance, loop, kept)
+    found |= {
+        "simc": rules.simc(model, dt_s, filter_s),
+        "simc-slow": rules.simc(model, dt_s, filter_s, 4 * delay_s),
+        "amigo": rules.amigo(model, dt_s, filter_s),
+        "lambda": rules.lambda_tuned(model, dt_s, filter_s),
+        "max-ki": rules.max_ki(model, dt_s, filter_s, demands.ms),
+        "ziegler-nichols": rules.ziegler_nichols(*relay_ultimate(model, dt_s)),
     }
-    return tuple(candidate(name, gains, model, disturbance, loop, demands) for name, gains in named.items())
+    return {name: gains.rounded() for name, gains in found.items()}
 
 
 def propose(
@@ -251,34 +270,26 @@ def propose(
             "open the bleed or find the leak, then repeat"
         )
     settled = feedforward_settings(loop, disturbance)
-    rows = candidates(model, disturbance, settled, demands)
-    chosen = rows[0]
+    plants = prediction.sampled_plants(identified, _PLANTS)
+
+    def row(name: str, gains: loop_model.Gains, around: LoopConfig) -> Candidate:
+        made = candidate(name, gains, model, disturbance, around, demands)
+        step = demands.load_step_um_per_s
+        spread = prediction.half_widths(
+            [prediction.loop_figures(gains, plant, disturbance, around, step) for plant in plants]
+        )
+        return replace(made, sigma=spread)
+
+    designed = [row(name, gains, settled) for name, gains in designs(model, disturbance, settled, demands).items()]
+    chosen = designed[0]
     if not chosen.margins.stable or chosen.margins.ms > 1.02 * demands.ms:  # the search's grid is good to 1 %
         raise RefusedError(f"no gains achieve Ms <= {demands.ms:g} on this plant: reduce the delay")
     proposed = chosen.gains.applied_to(settled)
     return Proposal(
         loop=proposed,
         chosen=chosen,
-        candidates=rows,
-        least_std_um=least_std_um(model, disturbance, settled),
+        candidates=(chosen, row(PRESENT, loop_model.Gains.of(loop), loop), *designed[1:]),
+        least_std_um=prediction.least_std_um(model, disturbance, settled),
         preview=preview(proposed, pump, model, disturbance),
-        robustness=robustness(chosen.gains, identified, disturbance, settled),
+        robustness=prediction.robustness(chosen.gains, identified, disturbance, settled),
     )
-
-
-def table(rows: tuple[Candidate, ...]) -> str:
-    """The candidates as a Markdown table."""
-    head = (
-        "| design | K 1/s | Ti s | Td s | filter s | std um | / least | flow std um/s | Ms | GM | PM deg "
-        "| delay margin s | disk margin | load peak um | over after s |\n|---" + "|---:" * 14 + "|"
-    )
-    lines = [head]
-    for row in rows:
-        g, m, p = row.gains, row.margins, row.predicted
-        std = f"{p.std_um:.3f} | {row.ratio:.2f} | {p.flow_std_um_per_s:.2f}" if p is not None else "unstable | | "
-        lines.append(
-            f"| {row.name} | {g.kp_per_s:.3f} | {g.ti_s:.2f} | {g.td_s:.2f} | {g.filter_s:.2f} | {std} | {m.ms:.2f} "
-            f"| {m.gain_margin:.1f} | {m.phase_margin_deg:.0f} | {m.delay_margin_s:.2f} | {m.disk_margin:.2f} "
-            f"| {row.load_peak_um:.2f} | {row.load_recovery_s:.1f} |"
-        )
-    return "\n".join(lines)

@@ -7,13 +7,15 @@ it can be inverted.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.arrays import FloatArray
+from tuning.gains_file import LoopFigures
 from tuning.identification import identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel
 
@@ -93,6 +95,31 @@ def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, 
     block = expm(np.block([[-drift, diffusion], [np.zeros((n, n)), drift.T]]) * step_s)
     transition = block[n:, n:].T
     return transition, transition @ block[:n, n:]
+
+
+def loop_figures(
+    gains: loop_model.Gains,
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    step_um_per_s: float,
+) -> LoopFigures:
+    """The figures on one plant; infinite for an unstable loop."""
+    dt_s = disturbance.rest.dt_s
+    ms = loop_model.sensitivity_peak(gains, model, dt_s)
+    if not math.isfinite(ms):
+        return LoopFigures(math.inf, math.inf, math.inf, math.inf)
+    answer = loop_model.load_step(gains, model, step_um_per_s, dt_s)
+    return LoopFigures(predict(gains, model, disturbance, loop).std_um, answer.peak_um, answer.recovery_s, ms)
+
+
+def half_widths(found: Sequence[LoopFigures]) -> LoopFigures:
+    """Half of the central 68 % of each figure over many plants: 1 sigma; infinite if some of them are unstable."""
+    rows = np.array([astuple(figures) for figures in found])
+    low, high = np.quantile(rows, (0.16, 0.84), axis=0, method="nearest")
+    with np.errstate(invalid="ignore"):  # infinite at both ends
+        widths = np.where(np.isinf(high), np.inf, (high - low) / 2)
+    return LoopFigures(*widths.tolist())
 
 
 # Evaluates a proposal on plants permitted by the data, drawn from the covariance of the fit.

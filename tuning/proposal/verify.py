@@ -69,6 +69,7 @@ class VerificationTrial:
     weather: disturbance.DisturbanceModel
     before: LoopConfig
     after: LoopConfig
+    accepted: bool = False  # a person chose these gains knowing that a larger deviation is predicted
 
 
 def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
@@ -118,7 +119,11 @@ def look(record: records.Record, setpoint_um: records.Series, trial: Verificatio
     if record.duration_s >= _OBSERVE_LEAST_S:
         weather = disturbance.observe(record, trial.model, trial.after)
     std_um = centre_std_um(off_um, trial, weather)
-    before_um = predict(loop_model.Gains.of(trial.before), trial.model, weather, trial.before).std_um
+    before_um, after_um = (
+        predict(loop_model.Gains.of(loop), trial.model, weather, loop).std_um for loop in (trial.before, trial.after)
+    )
+    if trial.accepted:
+        growth_max *= max(1.0, after_um / before_um)
     growth = std_um / before_um
     ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan
     reason = ""
