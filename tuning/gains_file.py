@@ -110,22 +110,12 @@ What = Literal["kept", "taken_back", "rolled_back"]
 
 
 @dataclass(frozen=True, slots=True)
-class LoopFigures:
-    """What a set of gains gives and costs, as predicted; or how well that is known (1 sigma)."""
-
-    std_um: float  # of the true centre
-    load_peak_um: float  # after a step of the leak
-    load_recovery_s: float
-    ms: float
-
-
-@dataclass(frozen=True, slots=True)
 class Traded:
     """The name of a candidate, and the figures before and with it."""
 
     candidate: str
-    before: LoopFigures
-    after: LoopFigures
+    before: loop_model.LoopFigures
+    after: loop_model.LoopFigures
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -17,8 +17,7 @@ from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
 from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel, observe
-from tuning.proposal import design, prediction, trade, verify
-from tuning.proposal.candidates import Demands
+from tuning.proposal import candidates, design, prediction, trade, verify
 from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
@@ -186,7 +185,7 @@ def offered(session: folder.SessionFolder) -> tuple[tuple[design.Candidate, ...]
         if row.gains == gains:
             return rows, row
     model = found_of(session).identified.model
-    edited = design.candidate(EDITED, gains, model, disturbance_of(session), loop, Demands())
+    edited = design.candidate(EDITED, gains, model, disturbance_of(session), loop, candidates.Demands())
     return (*rows, edited), edited
 
 

@@ -200,3 +200,13 @@ def load_step(gains: Gains, model: PlantModel, step_um_per_s: float, dt_s: float
     away = np.flatnonzero(away_um > RECOVERED_UM)
     over_s = (int(away[-1]) + 1) * _LOOK_S if away.size else 0.0
     return LoadStep(float(away_um.max()), over_s if over_s < _LOOKS // 2 * _LOOK_S else math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class LoopFigures:
+    """What a set of gains gives and costs, as predicted; or how well that is known (1 sigma)."""
+
+    std_um: float  # of the true centre
+    load_peak_um: float  # after a step of the leak
+    load_recovery_s: float
+    ms: float

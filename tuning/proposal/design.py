@@ -8,7 +8,6 @@ import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
-from tuning.gains_file import LoopFigures
 from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal import candidates as rules
@@ -157,13 +156,13 @@ class Candidate:
     # After the demanded step of the leak: largest excursion, and duration
     load_peak_um: float
     load_recovery_s: float
-    sigma: LoopFigures | None = None  # of the figures, from the fit's covariance
+    sigma: loop_model.LoopFigures | None = None  # of the figures, from the fit's covariance
 
     @property
-    def figures(self) -> LoopFigures:
+    def figures(self) -> loop_model.LoopFigures:
         """What is compared with the other candidates."""
         std_um = self.predicted.std_um if self.predicted is not None else math.inf
-        return LoopFigures(std_um, self.load_peak_um, self.load_recovery_s, self.margins.ms)
+        return loop_model.LoopFigures(std_um, self.load_peak_um, self.load_recovery_s, self.margins.ms)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,6 @@ from scipy.linalg import expm, solve_discrete_are
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.gains_file import LoopFigures
 from tuning.identification import identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel
 
@@ -103,23 +102,25 @@ def loop_figures(
     disturbance: DisturbanceModel,
     loop: LoopConfig,
     step_um_per_s: float,
-) -> LoopFigures:
+) -> loop_model.LoopFigures:
     """The figures on one plant; infinite for an unstable loop."""
     dt_s = disturbance.rest.dt_s
     ms = loop_model.sensitivity_peak(gains, model, dt_s)
     if not math.isfinite(ms):
-        return LoopFigures(math.inf, math.inf, math.inf, math.inf)
+        return loop_model.LoopFigures(math.inf, math.inf, math.inf, math.inf)
     answer = loop_model.load_step(gains, model, step_um_per_s, dt_s)
-    return LoopFigures(predict(gains, model, disturbance, loop).std_um, answer.peak_um, answer.recovery_s, ms)
+    return loop_model.LoopFigures(
+        predict(gains, model, disturbance, loop).std_um, answer.peak_um, answer.recovery_s, ms
+    )
 
 
-def half_widths(found: Sequence[LoopFigures]) -> LoopFigures:
+def half_widths(found: Sequence[loop_model.LoopFigures]) -> loop_model.LoopFigures:
     """Half of the central 68 % of each figure over many plants: 1 sigma; infinite if some of them are unstable."""
     rows = np.array([astuple(figures) for figures in found])
     low, high = np.quantile(rows, (0.16, 0.84), axis=0, method="nearest")
     with np.errstate(invalid="ignore"):  # infinite at both ends
         widths = np.where(np.isinf(high), np.inf, (high - low) / 2)
-    return LoopFigures(*widths.tolist())
+    return loop_model.LoopFigures(*widths.tolist())
 
 
 # Evaluates a proposal on plants permitted by the data, drawn from the covariance of the fit.

@@ -7,8 +7,7 @@ from rich.table import Table
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.gains_file import MS_MAX
-from tuning.proposal.candidates import Demands
-from tuning.proposal.design import PRESENT, Candidate
+from tuning.proposal import candidates, design
 
 HEADS = ("candidate", "K 1/s", "Ti s", "filter s", "std um", "load peak um", "recovery s", "Ms", "against present")
 MARGIN_HEADS = ("Td s", "/ least", "flow std um/s", "GM", "PM deg", "delay margin s", "disk margin")
@@ -17,14 +16,14 @@ _DIGITS = {"std_um": 3, "load_peak_um": 2, "load_recovery_s": 1, "ms": 2}
 _ALIKE = 0.02  # a smaller change is none
 
 
-def cells(rows: tuple[Candidate, ...]) -> list[tuple[str, ...]]:
+def cells(rows: tuple[design.Candidate, ...]) -> list[tuple[str, ...]]:
     """The cells under `HEADS`, the present gains first."""
-    present = next((row for row in rows if row.name == PRESENT), None)
+    present = next((row for row in rows if row.name == design.PRESENT), None)
     ordered = sorted(rows, key=lambda row: row is not present)
     return [(row.name, *_gains(row), *_figures(row), against(row, present)) for row in ordered]
 
 
-def table(rows: tuple[Candidate, ...]) -> str:
+def table(rows: tuple[design.Candidate, ...]) -> str:
     """The candidates as a Markdown table, with all margins."""
     heads = (*HEADS, *MARGIN_HEADS)
     margins = {row.name: _margins(row) for row in rows}
@@ -32,9 +31,9 @@ def table(rows: tuple[Candidate, ...]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def rich_table(rows: tuple[Candidate, ...], title: str, leak_um_per_s: float) -> Table:
+def rich_table(rows: tuple[design.Candidate, ...], title: str, leak_um_per_s: float) -> Table:
     """The candidates for a terminal; `leak_um_per_s` is what the mirror loses now."""
-    step = Demands().load_step_um_per_s
+    step = candidates.Demands().load_step_um_per_s
     caption = (
         f"load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
         "+-: 1 sigma of the fit; the weather of another hour changes every std alike."
@@ -47,7 +46,7 @@ def rich_table(rows: tuple[Candidate, ...], title: str, leak_um_per_s: float) ->
     return made
 
 
-def against(row: Candidate, present: Candidate | None) -> str:
+def against(row: design.Candidate, present: design.Candidate | None) -> str:
     """What gets better and what gets worse than with the present gains, as factors; or why it is not offered."""
     if row is present:
         return "in force"
@@ -65,7 +64,7 @@ def against(row: Candidate, present: Candidate | None) -> str:
     return "; ".join(f"{word}: {', '.join(said)}" for word, said in (("better", better), ("worse", worse)) if said)
 
 
-def refusal(row: Candidate) -> str:
+def refusal(row: design.Candidate) -> str:
     """Why these gains must not be applied; empty if they may."""
     if row.predicted is None:
         return "unstable"
@@ -78,12 +77,12 @@ def refusal(row: Candidate) -> str:
     return ""
 
 
-def _gains(row: Candidate) -> tuple[str, ...]:
+def _gains(row: design.Candidate) -> tuple[str, ...]:
     gains = row.gains
     return f"{gains.kp_per_s:.3f}", f"{gains.ti_s:.2f}", f"{gains.filter_s:.2f}"
 
 
-def _figures(row: Candidate) -> list[str]:
+def _figures(row: design.Candidate) -> list[str]:
     if row.predicted is None:
         return ["unstable", "", "", ""]
     found = [f"{getattr(row.figures, name):.{digits}f}" for name, digits in _DIGITS.items()]
@@ -93,7 +92,7 @@ def _figures(row: Candidate) -> list[str]:
     return [f"{value} +- {sigma}" for value, sigma in zip(found, sigmas, strict=True)]
 
 
-def _margins(row: Candidate) -> tuple[str, ...]:
+def _margins(row: design.Candidate) -> tuple[str, ...]:
     m, p = row.margins, row.predicted
     predicted = (f"{row.ratio:.2f}", f"{p.flow_std_um_per_s:.2f}") if p is not None else ("", "")
     margins = f"{m.gain_margin:.1f}", f"{m.phase_margin_deg:.0f}", f"{m.delay_margin_s:.2f}", f"{m.disk_margin:.2f}"
