@@ -1,4 +1,4 @@
-"""What every test must leave behind, no asyncio task and no child process; and the same examples at every run."""
+"""No test leaves an asyncio task or a child process behind; examples are the same in every run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ async def leaves_no_task() -> AsyncIterator[None]:
 
 @pytest.fixture
 def signals_are_heeded() -> Iterator[None]:
-    """Begun with `nohup`, or behind a script's `&`, a test ignores signals, and so would its children."""
+    """Started with `nohup`, or by a script's `&`, a test ignores signals, and so would its children."""
     before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT)}
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -43,7 +43,7 @@ def signals_are_heeded() -> Iterator[None]:
 
 @pytest.fixture
 def undrawn() -> Iterator[None]:
-    """For a test that looks at no picture; those of its module's fixtures are drawn before."""
+    """For a test that needs no picture; pictures of its module's fixtures are drawn before."""
     with undrawn_figures():
         yield
 

@@ -1,4 +1,4 @@
-"""Runs a command on a machine that stands still now and then, as a virtual one does, and is busy: `make shake`.
+"""Runs a command on a busy machine that pauses now and then, as a virtual one does: `make shake`.
 
 `python tests/shake.py [--every A B] [--still A B] [--hogs N] [--seed N] COMMAND...` stops all processes of the
 command for `still` seconds at random moments, `every` so many seconds. The clock goes on meanwhile.
@@ -21,7 +21,7 @@ HOG = [sys.executable, "-c", "while True: pass"]
 
 
 def processes_of(session: int) -> set[int]:
-    """Those of the command, orphans too, that are not stopped already by a test."""
+    """Processes of the command, orphans too, that no test has stopped already."""
     found = set()
     for process in psutil.process_iter():
         with suppress(psutil.Error, ProcessLookupError):
@@ -31,7 +31,7 @@ def processes_of(session: int) -> set[int]:
 
 
 def stand_still(session: int, seconds: float) -> None:
-    """Stop them all, those that are started meanwhile as well, and let them go on."""
+    """Stop them all, including new ones, and let them continue."""
     stopped: set[int] = set()
     while more := processes_of(session) - stopped:
         for pid in more:

@@ -1,8 +1,8 @@
-"""The event loop of the tests: its time stands still whenever the machine does.
+"""The event loop of the tests: its time stops whenever the machine does.
 
 A virtual machine that is paused for a second, or a processor that others take, stops a test's device and its client
-alike, while the clock goes on. On this loop no time-out of theirs runs out by that; a device that is silent while the
-loop runs still is.
+alike, while the clock goes on. On this loop such a pause causes no time-out; a device that is silent while the loop
+runs still is.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import asyncio
 import selectors
 import time
 
-LATE_S = 0.1  # later than that, a loop was kept from running
+LATE_S = 0.1  # later than that, the loop was suspended
 
 
 class SteadyLoop(asyncio.SelectorEventLoop):
@@ -26,7 +26,7 @@ class SteadyLoop(asyncio.SelectorEventLoop):
         return super().time() - self._stood_s
 
     def stood(self, seconds: float) -> None:
-        """So much is not to count."""
+        """Exclude this time."""
         self._stood_s += seconds
 
 

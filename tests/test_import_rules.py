@@ -1,4 +1,4 @@
-"""Who may import whom (docs/architecture.md). A rule that is broken here is a design that has slipped."""
+"""Who may import whom (docs/architecture.md). A broken rule here means that the design has slipped."""
 
 from __future__ import annotations
 
@@ -155,13 +155,13 @@ def modules_reached(start: str) -> set[str]:
 
 
 def test_the_control_process_loads_no_image_code_and_no_rerun() -> None:
-    """Nothing that could stall a tick is even imported beside it."""
+    """Nothing that could stall a tick is even imported."""
     reached = modules_reached("membrane_ctrl.hold.supervisor")
     heavy = {"membrane_ctrl.recorder", "membrane_ctrl.acquisition", "membrane_ctrl.metrology", "membrane_ctrl.sim"}
     assert not {m for m in reached if allowed(m, heavy)}
 
 
-# What runs code, or makes whatever object it is told to, out of bytes. Between this program's own parent and children
+# What runs code, or makes arbitrary objects, from bytes. Between this program's own parent and children
 # `multiprocessing` pickles by itself (what a child is given, what it reports): neither a file nor a name that a
 # stranger could give leads there.
 MAKES_OBJECTS = {
@@ -179,7 +179,7 @@ RUNS_CODE = {"eval", "exec", "compile", "__import__", "execfile"}
 
 
 def unsafe(path: Path) -> set[str]:
-    """What in a file could run code out of data."""
+    """Parts of a file that could run code from data."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     found = {module for module in imports_of(path) if module.split(".")[0] in MAKES_OBJECTS}
     for node in ast.walk(tree):
@@ -216,7 +216,7 @@ def test_the_rule_sees_what_would_run_data(tmp_path: Path, line: str) -> None:
 
 
 def test_the_rules_see_a_broken_one(tmp_path: Path) -> None:
-    """The checker itself: a late import inside a function does not escape it."""
+    """The checker itself: it finds an import inside a function."""
     bad = tmp_path / "bad.py"
     bad.write_text("def f():\n    from membrane_ctrl.metrology import phase\n")
     assert allowed("membrane_ctrl.metrology.phase", {"membrane_ctrl.metrology"})

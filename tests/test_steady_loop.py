@@ -1,4 +1,4 @@
-"""The loop on which the asynchronous tests run: what counts as time on it."""
+"""The loop of the asynchronous tests: what counts as time."""
 
 from __future__ import annotations
 

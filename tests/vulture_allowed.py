@@ -1,4 +1,4 @@
-"""What vulture cannot see in use, each with what uses it."""
+"""Names whose use vulture cannot see, each with its user."""
 
 _.connection_made, _.connection_lost, _.data_received, exc  # asyncio calls these of a protocol
 _.process_renderables, _.writelines  # Rich and `print` call these of a console and a stream
@@ -7,7 +7,7 @@ _.num_tickets  # ssl
 acquisition_main, alarms_main, console_main, recorder_main  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples  # written to the report by `asdict`
-Camera  # the role that the camera drivers fulfil, written down
+Camera  # the role that the camera drivers fill
 _.geometry_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
 _.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with

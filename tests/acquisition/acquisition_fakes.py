@@ -1,4 +1,4 @@
-"""A screen, a camera, a laser and a reconstructor that do as a test tells them, on a virtual clock."""
+"""A screen, a camera, a laser and a reconstructor scripted by a test, on a virtual clock."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Call:
 
 @dataclass
 class FakeReconstructor:
-    """Answers with the verdicts it was given, then with "ok"; takes 0.05 s."""
+    """Returns the given verdicts, then "ok"; takes 0.05 s."""
 
     clock: VirtualClock
     verdicts: list[tuple[Verdict, str]] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""The calibrate-display command: what a display is like, and what that would do to the fringes."""
+"""The calibrate-display command: properties of a display, and their effect on the fringes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a cycle shows, takes, hands on, and does after a failure."""
+"""What a cycle shows, takes, passes on, and does after a failure."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_settle_time_is_enough_and_not_much_more(tau_s: float) -> None:
     found = display_test(Bench(response)).settling()
     earliest_s = response.latency_s + tau_s * math.log(256)
     worst_s = earliest_s + 1 / response.refresh_hz
-    # gamma makes a panel of first order slower on its way up and faster on its way down
+    # gamma makes a first-order panel slower upwards and faster downwards
     assert 0.9 * earliest_s < found.settle_s < 1.4 * worst_s
 
 

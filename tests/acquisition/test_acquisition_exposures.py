@@ -1,4 +1,4 @@
-"""What overlaps in a cycle, and that a lost frame is taken again with its own pattern on the screen."""
+"""What overlaps in a cycle, and that a lost frame is retaken with its own pattern on the screen."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_three_in_a_row_are_a_failure_of_the_camera(frames: tuple[FrameWriter, F
     with pytest.raises(StageError, match="not whole") as failed:
         exposures.take(FRINGES, 1, lambda: False)
     assert failed.value.stage == "camera"
-    failed.value.__traceback__ = failed.value.__cause__ = None  # they hold the pixels of a slot
+    failed.value.__traceback__ = failed.value.__cause__ = None  # they keep the pixels of a slot alive
     del failed
 
 
@@ -160,4 +160,4 @@ def test_a_stopped_cycle_holds_no_pixels(plain: bool) -> None:
         else:
             exposures, split_camera = split(writer, clock)
             assert exposures.take(FRINGES, 1, lambda: split_camera.exposures == 3) is None
-            split_camera._out = None  # as a camera that is closed
+            split_camera._out = None  # like a closed camera

@@ -66,7 +66,7 @@ def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
     weak = LiveDrift(in_force(), 4)
-    # 2.83 urad of film, and 1.5 urad of a noise that was calibrated at 1.0 and grows as the light fades
+    # 2.83 urad of film, and 1.5 urad of noise that was 1.0 at the calibration and grows as the light fades
     faded = replace(CYCLE, modulation_median_adu=4.0)
     noise_urad = weak.noise_urad(faded)
     assert noise_urad == pytest.approx(20 * weak.noise_urad(CYCLE))

@@ -68,7 +68,7 @@ class Run:
         stack.callback(self._end)
 
     def until(self, happened: Callable[[], bool]) -> None:
-        """Tick as the control process would until something has happened."""
+        """Tick as the control process would until something happens."""
         give_up_s = self.clock.now() + PATIENCE_S
         while not happened():
             assert self.clock.now() < give_up_s, self.reports[-3:]
@@ -150,7 +150,7 @@ def test_pause_resume_full_and_sigterm(stack: ExitStack) -> None:
     run.until(lambda: len(run.estimates) >= taken + 2)
     assert [e.kind for e in run.estimates[taken : taken + 2]] == ["full", "fringes"]
     assert run.process.pid is not None
-    os.kill(run.process.pid, signal.SIGINT)  # not for this process
+    os.kill(run.process.pid, signal.SIGINT)  # not meant for this process
     os.kill(run.process.pid, STOP)
     run.until(lambda: not run.process.is_alive())
     assert run.process.exitcode == 0

@@ -1,4 +1,4 @@
-"""Which frames are kept on disk, and that what was kept can be measured."""
+"""Which frames are kept on disk, and that kept frames can be measured."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OPTICS = OpticsConfig(camera=CameraConfig(width_px=16, height_px=8))
 
 
 class Keeping:
-    """The ring of frames, the telemetry, and what keeps frames."""
+    """The ring of frames, the telemetry, and the keeper of frames."""
 
     def __init__(self, stack: ExitStack, folder: Path, **recording: int | float) -> None:
         frames = FrameRing.for_optics(OPTICS, 2)

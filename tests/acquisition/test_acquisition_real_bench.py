@@ -1,4 +1,4 @@
-"""The real process on a real bench: an X display, and an emulated GigE camera that sees what is on it."""
+"""The real process on a real bench: an X display, and an emulated GigE camera that sees it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ CONFIG = Config.model_validate(
 
 
 class Sight:
-    """What the camera sees in the film of what is on the display, byte for byte."""
+    """The display as the camera sees it in the film, byte for byte."""
 
     def __init__(self, framebuffer: Path) -> None:
         self._framebuffer = framebuffer
@@ -129,7 +129,7 @@ def test_cycles_through_display_and_camera(stack: ExitStack, camera: GigeCameraE
     run.until(lambda: any(e.kind == "fringes" and e.verdict == "ok" for e in run.estimates))
     fringes = next(e for e in run.estimates if e.kind == "fringes" and e.verdict == "ok")
     before = run.estimates[: run.estimates.index(fringes)]
-    # a cycle that a standing machine has spoilt is rejected, and a full one follows
+    # a cycle spoilt by a paused machine is rejected, and a full one follows
     assert all(cycle.kind == "full" or cycle.verdict == "rejected" for cycle in before[:-1])
     assert (before[-1].kind, before[-1].verdict) == ("full", "ok")
     assert before[-1].sag_um == pytest.approx(37_100, rel=0.01)
@@ -177,7 +177,7 @@ def test_check_names_what_is_wrong_with_the_screen(
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}
     assert "is 420 x 300, [devices.screen] says 640 x 300" in probes["camera"]["problem"]
     path.write_text(dump(CONFIG))
-    assert command(["check", str(path), "--json"]) == 4  # the board is not there
+    assert command(["check", str(path), "--json"]) == 4  # there is no board
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}
     assert probes["camera"]["problem"] == ""
     assert probes["camera"]["identity"].startswith("Aravis Fake EMU1")

@@ -46,7 +46,7 @@ class ScriptedRemote(Remote):
 
 
 class ScriptedCycle:
-    """Takes `duration_s` a cycle and gives the results it was told, then good ones."""
+    """Takes `duration_s` a cycle and returns the given results, then good ones."""
 
     def __init__(self, clock: VirtualClock, duration_s: float = 0.5) -> None:
         self.clock = clock
@@ -221,7 +221,7 @@ def test_closed_line_and_dead_parent_stop_the_process(
 def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
     remote = Remote(theirs)
-    for number in range(3000):  # far more than the line holds
+    for number in range(3000):  # far more than the pipe holds
         remote.report("running", f"{number:0200}", cycle=1)
     assert not remote.stop
     assert ours.recv() == {"kind": "acquisition", "state": "running", "message": "0" * 200, "cycle": 1}

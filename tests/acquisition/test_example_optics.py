@@ -38,12 +38,12 @@ def _example() -> Config:
 EXAMPLE = _example()
 GAMMA = 2.2
 LIGHT = (np.arange(256) / 255.0) ** GAMMA  # of a level
-STRIDE_PX = 5  # odd, so that of a checkerboard as many bright as dark pixels are looked at
+STRIDE_PX = 5  # odd, so that as many bright as dark pixels of a checkerboard are sampled
 BLOCK_PX = 4  # each block of camera pixels sees the mean light of its part of the display
 
 
 class StillPlant:
-    """A mirror that stands."""
+    """A mirror that does not move."""
 
     def sample(self) -> BoardSample:
         return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, 1, 0.0)
@@ -97,7 +97,7 @@ async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
 
 @pytest.fixture
 async def devices(camera: GigeCameraEmulator) -> AsyncIterator[DevicesConfig]:
-    """What the example names, emulated."""
+    """The devices of the example, emulated."""
     assert EXAMPLE.devices is not None
     lab = Lab(StillPlant(), EXAMPLE.devices)
     made = await lab.start()
@@ -115,7 +115,7 @@ async def test_the_example_passes_check_with_camera_and_screen(devices: DevicesC
     assert "settles in" in probe["notes"]
 
 
-@pytest.mark.campaign  # what a test of the display says is in test_acquisition_display_test.py
+@pytest.mark.campaign  # test_acquisition_display_test.py tests the findings about a display
 async def test_too_bright_a_picture_is_told(devices: DevicesConfig, tmp_path: Path) -> None:
     assert devices.camera is not None
     assert devices.screen is not None

@@ -1,4 +1,4 @@
-"""What people are told and when; time is a number here."""
+"""Which notices people get and when; time is a number here."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_acknowledged_it_is_quiet_until_it_is_over() -> None:
 def test_an_acknowledgement_is_not_for_what_comes_later() -> None:
     book = AlarmBook(CONFIG)
     book.take(BAD, 0.0)
-    book.acknowledge()  # nobody has been told of it yet
+    book.acknowledge()  # no notice of it was sent yet
     assert kinds(book.step(10.0)) == ["raised"]
     assert kinds(book.step(910.0)) == ["escalated"]
 
@@ -114,7 +114,7 @@ def test_alarms_stand_beside_each_other(name: str) -> None:
 
 
 class Disk:
-    """The recorder's recorder_errors as the alarms hear of them, at a time set by hand."""
+    """The recorder's errors as the alarms get them, at a time set by hand."""
 
     def __init__(self) -> None:
         self.book = AlarmBook(CONFIG)

@@ -184,7 +184,7 @@ def test_a_control_process_that_vanishes_is_told() -> None:
 
 
 class Target:
-    """What Apprise makes of an URL."""
+    """A target that Apprise makes of an URL."""
 
     sent: list[tuple[str, str, str, str]] = []  # noqa: RUF012  one list for all, as the test looks at it
 

@@ -1,4 +1,4 @@
-"""The runbook has what to do for every notice that can be sent."""
+"""The runbook has a remedy for every notice that can be sent."""
 
 from __future__ import annotations
 

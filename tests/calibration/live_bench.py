@@ -1,4 +1,4 @@
-"""A held mirror in virtual time whose sets are rendered on a bench that stands otherwise than stated."""
+"""A held mirror in virtual time whose sets are rendered on a bench that differs from the stated one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FILM = typical_film(37.1, 500.0, seed=4)
 
 
 def config(place: Path | None = None, **limits: float) -> Config:
-    """A mirror that loses and gets gas twenty times as fast as a real one: a minute instead of twenty."""
+    """A mirror that loses and gains gas twenty times as fast as a real one: a minute instead of twenty."""
     return Config(
         twin=TwinConfig(scenario="quiet", start_error_um=-3.0, leak_time_constant_s=500.0),
         pump=PumpConfig(flow_full_um_per_s=60.0),

@@ -19,7 +19,7 @@ from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
 from membrane_ctrl.sim.optics.trace import ScreenError
 
-# 16-bit frames of large pixels with the noise of the 64 that each stands for: what the paper's camera says
+# 16-bit frames of large pixels, each with the noise of the 64 of the paper's camera that it stands for
 SHRINK = 8
 NOISE = 256 * float(np.hypot(0.4, np.sqrt(1 / 12))) / SHRINK
 CAMERA = CameraConfig(
@@ -61,7 +61,7 @@ def calibrated(folders: list[Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def figure_error_um(height: Path, truth: Path) -> float:
-    """RMS error without the best plane; the truth is the twin's film, sampled where it was measured."""
+    """RMS error without the best plane; the truth is the twin's film at the measured points."""
     measured, moved = np.load(height), float(np.load(truth)["displacement_um"][0])
     x, y = np.meshgrid(measured["x_mm"], measured["y_mm"])
     seen = np.isfinite(measured["h_mm"])
@@ -111,7 +111,7 @@ def test_the_ring_says_where_the_camera_stands(
     report = json.loads(capsys.readouterr().out)
     pitch = next(row for row in report["parameters"] if row["name"] == "camera_pitch_deg")
     assert pitch["sigma_before"] == found["sigmas"]["camera_pitch_deg"]
-    assert abs(pitch["value"]) < 4 * pitch["sigma_before"]  # the pose is now what is stated
+    assert abs(pitch["value"]) < 4 * pitch["sigma_before"]  # the pose is now the stated one
 
 
 def test_a_rejected_calibration_leaves_the_old_geometry(
@@ -142,7 +142,7 @@ def test_a_set_with_a_bad_frame_is_used_with_a_word(
 ) -> None:
     spoilt = tmp_path / "spoilt"
     shutil.copytree(folders[4], spoilt)
-    shutil.copy(spoilt / "x_sin_1.png", spoilt / "x_sin_2.png")  # as a camera gives that was not triggered
+    shutil.copy(spoilt / "x_sin_1.png", spoilt / "x_sin_2.png")  # as from a camera that was not triggered
     words = ["calibrate", str(folders[0]), str(folders[2]), str(spoilt), "--out", str(tmp_path / "g.toml")]
     assert run([*words, "--json", "--no-pictures"]) == 0
     report = json.loads(capsys.readouterr().out)

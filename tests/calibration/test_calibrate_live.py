@@ -1,4 +1,4 @@
-"""`calibrate --live` on a hold in virtual time: aborted, gone on with, a bad set on its way, a geometry adopted."""
+"""`calibrate --live` on a hold in virtual time: aborted, continued, with a bad set, and adopted."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert run([*live, "--session", str(session)]) == 0
     said = capsys.readouterr()
     assert "2 of 3 sets" in said.err
-    assert bench.captures == 2 + 3  # the bad one again, the set that was there not
+    assert bench.captures == 2 + 3  # the bad one again, not the one that was there
     assert bench.hold.rows[-1].target_um == 0.0
     assert not [row for row in bench.hold.rows if row.fault]
     assert "not adopted; `membrane-ctrl calibrate --live --session" in said.err
@@ -131,7 +131,7 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     said = capsys.readouterr().err
     assert "the mirror is not held, but in state fault (" in said
     assert "the mirror is left to whoever has command; the shape loop is off" in said
-    assert bench.asked[-1].value == 500.0  # on its way to the second set; nothing was asked for after the fault
+    assert bench.asked[-1].value == 500.0  # on its way to the second set; no command after the fault
 
 
 def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(

@@ -1,4 +1,4 @@
-"""The exchange of a geometry's file: the old one is kept, and stays if the new one cannot be written."""
+"""Replacing a geometry file: the old one is kept, and stays if the new one cannot be written."""
 
 from __future__ import annotations
 

@@ -40,12 +40,12 @@ _AT = {at.name: at for at in SITUATIONS}
 STORIES = (*campaign_board_stories.STORIES, *campaign_sensor_stories.STORIES, *campaign_stories.STORIES)
 _STORIES = {story.__name__: story for story in STORIES}
 _HOLDS = {story.__name__: story for story in HOLDS}
-SHORT_SEEDS = (3, 4)  # mirrors that are drawn; the one may resume, the other may not
+SHORT_SEEDS = (3, 4)  # drawn mirrors; the first may resume, the second may not
 
 
 @dataclass(frozen=True)
 class Told:
-    """What came of one story."""
+    """Result of one story."""
 
     name: str
     about: str
@@ -55,7 +55,7 @@ class Told:
 
 @contextmanager
 def listening() -> Iterator[set[str]]:
-    """The names of the rules that trip meanwhile, the first cause or not."""
+    """The names of the rules that trip meanwhile, whether or not they are the first cause."""
     tripped: set[str] = set()
     judge = SafetyTable.judge
 
@@ -104,7 +104,7 @@ def run_all(processes: int) -> tuple[list[Result], list[Told]]:
 
 
 def run_short(first: str = "") -> Iterator[tuple[str, tuple[str, ...]]]:
-    """The stories, and every fault in two situations, some of them first: what each is called, and its violations."""
+    """The stories, and every fault in two situations, `first` first: name and violations of each."""
     parts = {
         "holds": _tell_short(_HOLDS),
         "board": _tell_short([story.__name__ for story in campaign_board_stories.STORIES]),
@@ -202,7 +202,7 @@ def _rules(results: list[Result], told: list[Told]) -> list[str]:
 
 
 def _processes() -> list[str]:
-    """The part about real processes, as it was written last."""
+    """The part about real processes, as last written."""
     found = DOCUMENT.read_text(encoding="utf-8").partition(_BEGIN)[2].partition(_END)[0]
     return [_BEGIN + found + _END, ""]
 

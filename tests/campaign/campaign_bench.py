@@ -30,7 +30,7 @@ WATCHDOG_S = 0.5
 
 @dataclass
 class Output:
-    """What the board gave to the pump, and when by the board's own clock."""
+    """The board's output to the pump, and its time by the board's own clock."""
 
     time_s: float
     pump_fraction: float
@@ -38,12 +38,12 @@ class Output:
 
 @dataclass
 class WatchedPlant:
-    """Stands between board and plant and notes every change of the pump's drive, and how far the mirror went."""
+    """Between board and plant: notes every change of the pump's drive, and how far the mirror went."""
 
     bench: LiveBench
     outputs: list[Output] = field(default_factory=list)
     looked_s: float = math.nan
-    longest_gap_s: float = 0.0  # between two looks of the board: what a busy machine adds to its watchdog
+    longest_gap_s: float = 0.0  # between two rounds of the board: a busy machine adds this to its watchdog
 
     displacement_max_um: float = -math.inf
     gauge_pressure_max_pa: float = -math.inf
@@ -89,7 +89,7 @@ class Run:
 
     @property
     def recorded(self) -> bool:
-        """The recorder has made its first round; until then what was measured is in the rings alone."""
+        """Whether the recorder has made its first round; until then the measurements are only in the rings."""
         return any(self.folder.glob("logs/*/.recorder-state"))
 
     def reached(self, state: str) -> bool:
@@ -99,7 +99,7 @@ class Run:
         return [event["name"] for event in self.events if event["kind"] == "fault"]
 
     def happened(self, kind: str, **words: Any) -> bool:
-        """Whether an event of this kind, and with these words in it, is on record."""
+        """Whether an event of this kind with these words was recorded."""
         return any(event["kind"] == kind and words.items() <= event.items() for event in self.events)
 
     def recorder(self) -> psutil.Process:
@@ -110,7 +110,7 @@ class Run:
         raise LookupError("no child has the recording open")
 
     def acquisition(self) -> psutil.Process:
-        """The child that steps back furthest: the one that measures the shape."""
+        """The child with the lowest priority: the one that measures the shape."""
         return max(psutil.Process(self.process.pid).children(), key=lambda child: child.nice())
 
     async def until(self, what: Callable[[], bool]) -> None:
@@ -146,7 +146,7 @@ async def running(
     environment: Mapping[str, str] | None = None,
     terminal: int = asyncio.subprocess.DEVNULL,
 ) -> AsyncIterator[Run]:
-    """A board, and a hold of it that is under way, on a terminal if there is one; both are gone afterwards."""
+    """A board and a running hold of it, on a terminal if given; both end afterwards."""
     on_terminal = terminal != asyncio.subprocess.DEVNULL
     board = PumpBoardEmulator(plant)
     await board.start()

@@ -1,4 +1,4 @@
-"""What may go wrong in the campaign, and what must come of it: one row a fault."""
+"""The faults of the campaign, and what must follow them: one row a fault."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State
 
 @dataclass(frozen=True)
 class Reaction:
-    """A fault that lasts must have led to `rung` or deeper `within_s` after it set in."""
+    """A lasting fault must have led to `rung` or deeper `within_s` after it began."""
 
     rung: Rung
     within_s: float
@@ -70,12 +70,12 @@ class Case:
 
     @property
     def lasting(self) -> bool:
-        """It stays to the end, and what has to follow it has to follow it to the end."""
+        """Whether it stays to the end, and with it what must follow."""
         return math.isinf(self.for_s) and not self.believed
 
     @property
     def hidden(self) -> bool:
-        """It shows only while the mirror is held: in `fault` nobody can say whether it is still there."""
+        """Whether it shows only while the mirror is held: in `fault` it cannot be seen."""
         of_actuators = {"pump_share", "pump_stuck_fraction", "vent_stuck_fraction"}
         return (
             self.power_cycle or self.leak_factor != 1.0 or self.door_pa != 0 or bool(of_actuators & self.wrong.keys())
@@ -83,7 +83,7 @@ class Case:
 
     @property
     def lies(self) -> bool:
-        """The mirror is not where a sensor says."""
+        """Whether the mirror is not where a sensor reads it."""
         return self.laser_lies or "camera_offset_um" in self.wrong
 
     @property
@@ -92,7 +92,7 @@ class Case:
         return not self.said
 
     def reaction(self, state: State) -> Reaction | None:
-        """What must follow when it sets in while the controller is in `state`."""
+        """What must follow when it begins while the controller is in `state`."""
         if self.always is not None and (state != State.FAULT or self.always.rung == Rung.VENT):
             return self.always
         if self.holding is not None and state == State.HOLD:
@@ -105,7 +105,7 @@ def _case(name: str, said: str = "", **rest: object) -> Case:
 
 
 _LOST = "displacement_missing displacement_frozen overdue"
-_SOON = 4 * TICK_S  # two ticks after a rule that looks once, and the tick in which it sets in
+_SOON = 4 * TICK_S  # two ticks after a rule with a window of one, and the tick in which the fault begins
 _TESTED = Reaction(Rung.PUMP_OFF, 10.0)  # the actuator test, twice
 
 CASES: tuple[Case, ...] = (
@@ -118,7 +118,7 @@ CASES: tuple[Case, ...] = (
         wrong={"no_light": 1},
         for_s=1.6,
         every_s=2.0,
-        moving=Reaction(Rung.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of what is used of the rung come back
+        moving=Reaction(Rung.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of the used budget recover
     ),
     _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
     _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
@@ -310,7 +310,7 @@ CASES: tuple[Case, ...] = (
 
 @dataclass(frozen=True)
 class Situation:
-    """Where the controller is when something goes wrong, and how it got there.
+    """State of the controller when something goes wrong, and how it got there.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Stories with the real supervisor, drivers and files.
 
-The matrix runs `virtual.run` in the supervisor's place. Here it is the supervisor itself, over the board and over a
+The matrix runs `hold.virtual_run` instead of the supervisor. This is the supervisor itself, over the board and over a
 bench of single instruments, with its way out, its guards, its latched-fault file and its software watchdog.
 """
 
@@ -171,7 +171,7 @@ async def faults_that_outlive_the_run() -> list[str]:
 
 @dataclass
 class _Told:
-    """A tick that told one event."""
+    """A tick that reported one event."""
 
     of: TickOutputs
     events: tuple[Event, ...]
@@ -297,7 +297,7 @@ async def the_supervisor_hangs() -> list[str]:
 
         async def hang(command: BenchCommand) -> None:
             await hung.wait()
-            await write(command)  # what was under way when it hung
+            await write(command)  # the write that was under way when it hung
 
         lab.bench.write = hang  # type: ignore[method-assign]
         await rig.wait(WATCHDOG_S * 1.5 + 2 * TICK_S)

@@ -1,4 +1,4 @@
-"""Single instruments at a plant, in memory: what they are given and what they say is arithmetic of this module."""
+"""Single instruments at a plant, in memory, converted by this module's own arithmetic."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Registers:
         return [round(4000 + 16000 * (self._value() - self._low) / (self._high - self._low))]
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        """What the actuator is given: nothing for a wire that is broken, full scale at most."""
+        """The actuator's drive: nothing with a broken wire, full scale at most."""
         if address != 0 or len(words) != 1:
             raise RegisterRefusal(2)
         share = min(max((words[0] - 4000) / 16000, 0.0), 1.0)
@@ -48,7 +48,7 @@ class TableLink:
         self.name, self.table = name, table
         self.plugged, self.connected = True, False
         self.lose = 0
-        self.deaf = False  # to what is written
+        self.deaf = False  # to writes
 
     async def connect(self) -> None:
         if not self.plugged:
@@ -89,7 +89,7 @@ class TableLink:
 
 
 class Instruments:
-    """Single instruments at a plant, in memory: what they are given and what they say is arithmetic of this class."""
+    """Single instruments at a plant, in memory, converted by this class's own arithmetic."""
 
     def __init__(self, plant: WatchedPlant, bronkhorst: bool) -> None:
         self._plant, self._at_s = plant, 0.0

@@ -1,4 +1,4 @@
-"""One run of the campaign: bring the controller somewhere, let something go wrong, watch to the end of the story.
+"""One run of the campaign: bring the controller to a state, let something go wrong, monitor to the end.
 
 The end: 45 s after the fault, in which every safe level has had its time, somebody asks for a stop.
 """
@@ -48,7 +48,7 @@ THE_STOP_S = 12.0
 GIVE_UP_S = 120.0
 _ROUNDING_S = 1e-6  # one tick is one tick, wherever on the clock it lies
 PAUSE_S, MANUAL_S, MANUAL_RANGE_UM = 20.0, 60.0, 20.0
-# what a person might list; what has vented may not resume whatever is listed
+# what a person might list; a fault that vented may never resume
 RESUMABLE = (
     "link_lost", "device_silent", "watchdog_tripped", "board_fault", "displacement_missing", "displacement_frozen",
     "pressure_missing", "late", "over_pressure", "over_displacement", "following_error", "overdue",
@@ -57,7 +57,7 @@ RESUMABLE = (
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one run; `violations` is empty when every invariant held, `tripped` names rules."""
+    """Result of one run; `violations` is empty when every invariant held, `tripped` names rules."""
 
     case: str
     situation: str
@@ -70,7 +70,7 @@ class Result:
 
 
 class Injection:
-    """Puts the fault in at its time, and takes it away again."""
+    """Begins the fault at its time, and ends it."""
 
     def __init__(self, case: Case, bench: VirtualBench) -> None:
         self._case, self._bench = case, bench
@@ -165,7 +165,7 @@ def config_of(seed: int, world: World, resumes: bool) -> Config:
 
 
 def _bench(config: Config, world: World, case: Case | None = None, begins_s: float = 0.0) -> VirtualBench:
-    """The mirror and its board; what happens to the mirror itself is told to the plant beforehand."""
+    """The mirror and its board; the plant gets events of the mirror itself beforehand."""
     events: list[AmbientChange | LeakChange] = []
     if case is not None and case.leak_factor != 1.0:
         events.append(LeakChange(begins_s, case.leak_factor))
@@ -178,7 +178,7 @@ _BEGINS: dict[tuple[int, World, str], float] = {}
 
 
 def _begins_s(config: Config, world: World, at: Situation) -> float:
-    """When the situation is reached without a fault."""
+    """Time at which the situation is reached without a fault."""
     key = (config.twin.seed, world, at.name)
     if key not in _BEGINS:
         bench = _bench(config, world)
@@ -221,7 +221,7 @@ class _Script:
             self._gone = self.there
 
     def commands(self, now_s: float) -> tuple[Command, ...]:
-        """What is asked for in this tick."""
+        """The commands of this tick."""
         asked: list[Command] = []
         if self._at.state != State.STANDBY and not self._hold_asked:
             self._hold_asked = True
@@ -245,7 +245,7 @@ class _Script:
 
 @contextlib.contextmanager
 def _raising(case: Case, injection: Injection) -> Iterator[None]:
-    """Let every handler raise once the fault has set in."""
+    """Let every handler raise once the fault has begun."""
     if not case.raises:
         yield
         return

@@ -1,4 +1,4 @@
-"""Stories of sensors and actuators: clocks that stand, lasers that creep, pumps that do not obey."""
+"""Stories of sensors and actuators: stopped clocks, creeping lasers, pumps that do not obey."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def pressure_in_standby() -> list[str]:
 
 
 def creeping(stage: Stage, um_per_s: float, deepest_um: float) -> Callable[[], str]:
-    """The laser's mount moves on by a tick; what is wrong if the bowl has followed it too far."""
+    """The laser's mount moves by a tick's drift; the violation if the bowl has followed it too far."""
 
     def creep() -> str:
         stage.bench.wrong.laser_offset_um -= um_per_s * TICK_S

@@ -1,4 +1,4 @@
-"""A mirror, its board and its controller, for stories: ask, wait, and say what is not as it has to be."""
+"""A mirror, its board and its controller, for stories: command, wait, and note what is wrong."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WORDS = 2**16
 
 @dataclass
 class Stage:
-    """A mirror, its board and its controller; `violations` is what was not as it had to be."""
+    """A mirror, its board and its controller; `violations` lists what was wrong."""
 
     world: World = field(default_factory=World)
     resumes: bool = False
@@ -56,7 +56,7 @@ class Stage:
         self.tick(*(Command(kind, "story", value=value) for kind in kinds))
 
     def wait(self, seconds: float, check: Callable[[], str] | None = None) -> None:
-        """Let time pass; `check` says what is wrong now."""
+        """Let time pass; `check` returns what is wrong now."""
         for _ in range(round(seconds / TICK_S)):
             self.tick()
             if check is not None and (wrong := check()):
@@ -77,12 +77,12 @@ class Stage:
         return self
 
     def must(self, true: bool, what: str) -> None:
-        """Note what is not true."""
+        """Note a violation unless this is true."""
         if not true and len(self.violations) < 3:
             self.violations.append(f"{self.run.now_s:.2f} s in {self.state.name.lower()}: {what}")
 
     def still(self) -> str:
-        """What is wrong if the pump is driven."""
+        """The violation if the pump is driven."""
         return f"the pump is driven with {self.plant.pump_given:.2f}" if self.plant.pump_given > 0 else ""
 
     def near(self, target_um: float = 0.0, within_um: float = 10.0) -> None:
@@ -95,13 +95,13 @@ Change = Callable[[BoardSample], BoardSample]
 
 
 def sensors_say(stage: Stage, change: Change) -> None:
-    """Put something between the plant and the board."""
+    """Insert sensors between the plant and the board."""
     sample_of = stage.plant.sample_of
     stage.plant.sample_of = lambda truth: change(sample_of(truth))  # type: ignore[method-assign]
 
 
 class OldBoard(Stage):
-    """A board that has been on for long: its heartbeat and its sample counter are about to wrap."""
+    """A board that has long been on: its heartbeat and its sample counter are about to wrap."""
 
     def make_bench(self) -> VirtualBench:
         sensors_say(self, lambda sample: replace(sample, sample_counter=sample.sample_counter + 2**32 - 500))

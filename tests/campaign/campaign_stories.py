@@ -1,6 +1,6 @@
-"""Stories of orders: what people ask for, in what order, and what the controller makes of it.
+"""Stories of commands: what people send, in what order, and what the controller does.
 
-Each story gives what went wrong; judged is the true mirror, as in the matrix.
+Each story returns its violations; it judges the true mirror, as the matrix does.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def a_pause_ends() -> list[str]:
     stage = Stage(world=World(leak=1.2)).held()
     stage.wait(20.0)
     stage.ask("pause")
-    stage.plant._leak_ml_per_s_per_pa *= 1.2  # the mean flow is no longer enough
+    stage.plant._leak_ml_per_s_per_pa *= 1.2  # the mean flow no longer suffices
     stage.wait(50.0)
     stage.near()
     return stage.violations

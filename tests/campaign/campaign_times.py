@@ -1,4 +1,4 @@
-"""What the campaign configures, and holds the code to: limits, and how long each rung may last."""
+"""The campaign's configuration and its demands on the code: limits, and how long each safe level may last."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GAUGE_STUCK_S = 5.0
 BOARD_PRESSURE_MAX_PA = 800.0
 RESUME_WAIT_S = 3.0
 RESUMES_A_DAY = 2
-# a lasting fault that enters on a rung has stopped the pump, and has opened the vent, by so long after
+# after a lasting fault enters on a safe level, the pump must stop and the vent open within these times
 OFF_AFTER_S = {Rung.HOLD_FLOW: HOLD_FLOW_S + RAMP_S, Rung.RAMP_DOWN: RAMP_S, Rung.PUMP_OFF: 0.0, Rung.VENT: 0.0}
 VENTS_AFTER_S = {
     Rung.HOLD_FLOW: HOLD_FLOW_S + RAMP_S + PUMP_OFF_S,
@@ -21,7 +21,7 @@ VENTS_AFTER_S = {
     Rung.PUMP_OFF: PUMP_OFF_S,
     Rung.VENT: 0.0,
 }
-# limits close to the work, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
+# limits near the setpoint, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
 DISPLACEMENT_MIN_UM, DISPLACEMENT_MAX_UM = -80.0, 40.0
 FOLLOWING_ERROR_MAX_UM = 25.0
 GAUGE_MARGIN_PA = 5.0  # over the pressure at which the mirror is held

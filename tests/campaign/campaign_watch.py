@@ -1,8 +1,8 @@
-"""The invariants of the campaign, looked at from outside after every period, to the end of the story.
+"""The invariants of the campaign, checked from outside after every period, to the end of a run.
 
-What counts is the true mirror: its pressure, its sag, and what arrives at the pump's motor and at the valve. The
-controller's own words (state, rung, cause) are looked at, too, but excuse nothing. Limits and times are the
-campaign's own: a limit that moves in the code under test moves none here.
+The true mirror counts: its pressure, its sag, and the drive of the pump's motor and of the valve. The controller's
+own reports (state, safe level, cause) are checked too, but excuse nothing. Limits and times are the campaign's own: a
+limit that changes in the code under test changes none here.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _STILL = {State.STANDBY, State.LOWER}
 _LATCHED_FAULTS = default_map().register("latched_faults").address
-# two looks and the tick between at full pump, its lag, and three sigma of the reading
+# two readings and the tick between at full pump, its lag, and three sigma of the reading
 _OVERSHOOT_UM = 8.0
 # 22 s on the mean flow and down again, in the strongest weather
 _BLIND_UM = 40.0
 _GAUGE_SLACK_PA = 2.0  # four sigma of the gauge
 _SLACK_S = 0.25  # six ticks
-_HELD_UM = 10.0  # a mirror that nothing dangerous has happened to, in the strongest weather
+_HELD_UM = 10.0  # an undisturbed mirror, in the strongest weather
 _STEADY = 0.02
 _EVENT_BYTES = 4096
 
 
 class Watch:
-    """Looks at controller, board and truth, and writes down what must not be.
+    """Monitors controller, board and truth, and notes violations.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Watch:
         self._look_at_reaction(now_s)
 
     def before_the_stop(self, now_s: float) -> None:
-        """The aftermath is over, nobody has asked for anything yet."""
+        """Check at the end of the aftermath, before any command."""
         reaction = self._case.reaction(self._state_then)
         if reaction is not None and not self._met and "stalled" not in self._case.wrong:
             self._say(now_s, f"never came to {reaction.rung.name}; got to {self.deepest.name}")
@@ -118,7 +118,7 @@ class Watch:
             self._say(now_s, f"called {said}")
 
     def after_the_stop(self, run: VirtualRun) -> None:
-        """Somebody has asked for a stop and waited."""
+        """Check after a stop was commanded and awaited."""
         wrong = self._bench.wrong
         if wrong.stalled:
             return
@@ -169,7 +169,7 @@ class Watch:
             self.code = row.fault
 
     def _look_at_fault(self, before: State, code: float, now_s: float) -> None:
-        """In `fault` the first cause stays; out of it, without a person, leads only the resume rule."""
+        """In `fault` the first cause stays; without a person, only the resume rule leads out."""
         if self.state == State.FAULT:
             if before != State.FAULT:
                 self._fault_s, self._fault_pump = now_s, self._plant.pump_given
@@ -199,7 +199,7 @@ class Watch:
         if self.state == State.FAULT and plant.vent_given >= 1 and math.isnan(wrong.vent_stuck_fraction):
             self._vented = True
         if quiet_s > 0:
-            board.read(_LATCHED_FAULTS, 1)  # somebody else looks: that is no controller that lives
+            board.read(_LATCHED_FAULTS, 1)  # another program reads: that proves no living controller
         seen_pa = self._bench.truth.gauge_pressure_pa + wrong.gauge_offset_pa
         if seen_pa > BOARD_PRESSURE_MAX_PA + _GAUGE_SLACK_PA and not wrong.gauge_lost and not wrong.samples_frozen:
             self._vented = self._board_vents = True
@@ -215,7 +215,7 @@ class Watch:
         board_max_pa = max(self._gauge_max_pa, BOARD_PRESSURE_MAX_PA) + hidden_pa + _GAUGE_SLACK_PA
         if truth.gauge_pressure_pa > board_max_pa:
             self._say(now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa, above the board's limit")
-        ended = self._ended and not self._obeys  # from then on only the board's own limit is there
+        ended = self._ended and not self._obeys  # from then on only the board's own limit protects
         if unseen or ended:
             return
         if not case.gauge_lies and truth.gauge_pressure_pa > self._gauge_max_pa + _GAUGE_SLACK_PA:
@@ -232,7 +232,7 @@ class Watch:
             self._say(now_s, f"blind, and the bowl went from {self._blind_um:.1f} to {truth.displacement_um:.1f} um")
 
     def _look_at_the_way_down(self, now_s: float) -> None:
-        """The pump stands where it must stand, stops in its time, and the vent opens in its."""
+        """The pump is off where it must be, stops in time, and the vent opens in time."""
         given, wrong = self._plant.pump_given, self._bench.wrong
         reached = not (wrong.unreachable or wrong.stalled) and now_s == self._last_tick_s
         self._still_ticks = self._still_ticks + 1 if self.state in _STILL or self._rung >= Rung.PUMP_OFF else 0
@@ -281,7 +281,7 @@ class Watch:
         if not self._met and self._rung >= reaction.rung:
             self._met = True
         elif not self._met and now_s - self._begun_s > reaction.within_s + 1e-9:
-            self._met = True  # say it once
+            self._met = True  # report it once
             self._say(now_s, f"on {self._rung.name}, not on {reaction.rung.name} {reaction.within_s:.2f} s after")
         if not self._case.lasting:
             return

@@ -19,7 +19,7 @@ _PRESSURE_PA, _LEAK_UM_PER_S, _LEAK_TIME_CONSTANT_S = 600.0, 1.24, 1.0e4
 
 @dataclass(frozen=True)
 class World:
-    """What the controller does not know of the mirror: how far it is from what the configuration says.
+    """What the controller does not know of the mirror: its deviation from the configuration.
 
     Attributes
     ----------
@@ -41,12 +41,12 @@ class World:
 
     @property
     def pressure_pa(self) -> float:
-        """Where the mirror is held."""
+        """Gauge pressure at which the mirror is held."""
         return float(_PRESSURE_PA / self.softness**3)
 
     @property
     def holding_flow_um_per_s(self) -> float:
-        """What has to be asked of the pump for the mirror to stay where it is."""
+        """Nominal flow that keeps the mirror in place."""
         return _LEAK_UM_PER_S * self.leak / self.pump_gain
 
     def twin(self, seed: int) -> TwinConfig:
@@ -69,12 +69,12 @@ def world_of(seed: int, rng: np.random.Generator) -> World:
 
 
 class WatchedPlant(Plant):
-    """A plant of a world, with a note of what its actuators are given.
+    """A plant of a world that notes the drive of its actuators.
 
     Attributes
     ----------
     pump_given, vent_given : float
-        What arrives at the pump's motor and at the valve, whoever sent it.
+        Drive of the pump's motor and of the valve, whoever sent it.
     """
 
     def __init__(self, world: World, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:

@@ -1,4 +1,4 @@
-"""The real supervisor over a bench in memory, on an event loop in virtual time, and what is seen of it outside."""
+"""The real supervisor over a bench in memory, on an event loop in virtual time, observed from outside."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class LoopClock:
 
 
 class BoardBench:
-    """The board in memory, brought to the event loop's time by whoever asks it something."""
+    """The board in memory, advanced to the event loop's time at every access."""
 
     def __init__(self, plant: WatchedPlant) -> None:
         self.virtual = VirtualBench(plant, WATCHDOG_S)
@@ -93,7 +93,7 @@ class BoardBench:
 
 @dataclass
 class HoldRig:
-    """A supervisor at work, and what is seen from outside; `violations` is what was not as it had to be."""
+    """A running supervisor, observed from outside; `violations` lists what was wrong."""
 
     plant: WatchedPlant
     bench: Bench
@@ -112,7 +112,7 @@ class HoldRig:
         return State(int(self.heard[-1].row.state)) if self.heard else State.STANDBY
 
     def must(self, true: bool, what: str) -> None:
-        """Note what is not true."""
+        """Note a violation unless this is true."""
         if not true and len(self.violations) < 3:
             now_s = asyncio.get_running_loop().time()
             self.violations.append(f"{now_s:.2f} s in {self.state.name.lower()}: {what}")
@@ -134,7 +134,7 @@ class HoldRig:
         self.must(False, f"{state.name} did not come within {most_s:g} s")
 
     def still(self) -> str:
-        """What is wrong if the pump is driven."""
+        """The violation if the pump is driven."""
         return f"the pump is driven with {self.plant.pump_given:.2f}" if self.plant.pump_given > 0 else ""
 
     def near(self) -> None:

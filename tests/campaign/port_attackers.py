@@ -1,4 +1,4 @@
-"""Clients that nobody wants at the control port, each until it is cancelled: they come again when thrown out."""
+"""Hostile clients of the control port, each until it is cancelled: they reconnect when thrown out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Attack = Callable[[asyncio.StreamReader, asyncio.StreamWriter, random.Random], C
 
 
 async def nonsense(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
-    """Bytes of all kinds, as fast as they are taken."""
+    """Random bytes, as fast as they are accepted."""
     writer.write(chance.randbytes(300) + b"\n" + b'{"do": "no such thing", "number": 1}\n' + b"[[[[[[" * 100 + b"\n")
     await writer.drain()
 
@@ -40,7 +40,7 @@ async def deaf(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chanc
 
 
 async def flood(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
-    """Comes and goes."""
+    """Connects and disconnects."""
     raise ConnectionError
 
 
@@ -67,5 +67,5 @@ async def attack_together(socket: Path, each: int) -> None:
     await asyncio.gather(*(attack(socket, seed, how) for seed in range(each) for how in ATTACKS))
 
 
-if __name__ == "__main__":  # a process of its own: the bench in the test's process must not feel it
+if __name__ == "__main__":  # a separate process: the bench in the test's process must not notice it
     asyncio.run(attack_together(Path(sys.argv[1]), int(sys.argv[2])))

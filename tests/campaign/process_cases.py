@@ -1,4 +1,4 @@
-"""Faults of real processes: what is done to a hold, and what must come of it."""
+"""Faults of real processes: what is done to a hold, and what must follow."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HANG_S = 3.0
 WALL_CLOCK = "wall-clock-step"  # a file that says by how many seconds it is off
 CLOCK, DISK = "a wall clock of its own", "a small disk"
 _DAY_S = 86_400
-# The board has stopped the pump by itself, and the tick that wakes up finds one of these first.
+# The board has stopped the pump by itself; the first tick afterwards finds one of these.
 _STOPPED = ("watchdog_tripped", "board_fault", "device_silent", "displacement_frozen", "late", "displacement_missing")
 _CUT = ("link_lost",)
 _QUIET = ("device_silent", "link_lost", "displacement_missing")
@@ -32,7 +32,7 @@ class ProcessCase:
     Attributes
     ----------
     act : callable
-        Does it, and waits for what must follow; takes it back where the rest of the run needs that.
+        Does it, and waits for what must follow; undoes it where the rest of the run needs that.
     exit : int
         Exit code; for a run that a safety trip does not end, that of the interruption at the end.
     faults : tuple of str
@@ -81,7 +81,7 @@ async def stop_recorder(run: Run) -> None:
 
 
 async def slow_disk(run: Run) -> None:
-    """A disk that takes 10 s for a second of data, seen from outside: the recorder stands, and goes on."""
+    """A disk that takes 10 s for a second of data: seen from outside, the recorder stops and continues."""
     recorder = run.recorder()
     recorder.suspend()
     await asyncio.sleep(10.0)
@@ -157,7 +157,7 @@ async def kill_both(run: Run) -> None:
     recorder = run.recorder()
     run.signal(signal.SIGKILL)
     recorder.kill()
-    await asyncio.sleep(6.0)  # `repair` takes a run that was written to within 5 s for one that still goes on
+    await asyncio.sleep(6.0)  # `repair` takes a run that changed within 5 s for one in progress
 
 
 async def stopped_recorder_and_power_cycle(run: Run) -> None:
@@ -181,7 +181,7 @@ def filled(folder: Path) -> Iterator[None]:
 TRIP = int(Exit.SAFETY_TRIP)
 PROCESS_CASES: tuple[ProcessCase, ...] = (
     ProcessCase("control process stopped for 3 s", stop_control, TRIP, _STOPPED, stops_pump=True),
-    # a tick that was late when it was killed is no telemetry
+    # a tick that was late at the kill is no telemetry
     ProcessCase("control process killed", kill_control, -signal.SIGKILL, stops_pump=True, lost_s=0.1),
     ProcessCase("event loop hangs for 3 s", hang_loop, TRIP, _STOPPED, stops_pump=True),
     ProcessCase("recorder killed", kill_recorder),

@@ -1,4 +1,4 @@
-"""One fault of real processes: a hold against the emulated board, and what must be true of it afterwards."""
+"""One fault of real processes: a hold against the emulated board, and what must be true afterwards."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _GAUGE_SLACK_PA = 1.5  # three sigma of the gauge
 
 @dataclass(frozen=True, slots=True)
 class ProcessResult:
-    """What came of a case.
+    """Result of a case.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ def missing(case: ProcessCase) -> str:
 
 
 async def run_process_case(case: ProcessCase, folder: Path) -> ProcessResult:
-    """Run it, and look at everything it has left."""
+    """Run it, and check everything it left."""
     plant = make_plant()
     environment = {"PYTHONPATH": str(UPSET), "HANG_S": str(HANG_S)}
     if case.needs == CLOCK:
@@ -121,7 +121,7 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
 
 
 def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
-    """Seconds of ticks that no table has, up to the run's last tick, or to the moment when it was killed."""
+    """Seconds of ticks missing in every table, up to the run's last tick or the kill."""
     run = open_run(run_dir)
     table = run.ticks(["tick"])
     ticks = table.column("tick").to_numpy()
@@ -138,7 +138,7 @@ def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
 
 
 def utc_is_steady(run: Run) -> bool:
-    """Whether UTC of the events goes with the run's own seconds, whatever the wall clock does."""
+    """Whether the events' UTC agrees with the run's own seconds, whatever the wall clock does."""
     from datetime import datetime
 
     starts = [datetime.fromisoformat(e["time_utc"]).timestamp() - e["mono_s"] for e in run.events if "mono_s" in e]

@@ -1,7 +1,7 @@
-"""Every sensor, every way in which it can be wrong: what notices it, how soon, and what the true mirror does.
+"""Every sensor, every way in which it can fail: what notices it, how soon, and what the true mirror does.
 
-The sensors lie between the plant and the board, so that the board's own limits are deceived as well; what is judged
-is the plant. `sensor_faults_page.py` writes what came of it.
+The faulty sensors are between plant and board, so that the board's own limits are deceived as well; the plant's true
+state is judged. `sensor_faults_page.py` writes the results.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.bench_events import AmbientChange, BenchEvent
 
 RATE_HZ = 10.0
-REGISTER_MAX = 2e6  # what does not fit a register of the board is sent as none
+REGISTER_MAX = 2e6  # a value that does not fit a register of the board is sent as no value
 SETTLED_S = 240.0
 NAMES = {float(rule.code): rule.name for rule in TABLE}
-# Where a sensor's value is; the read-backs are the board's own and are changed behind it, the camera by itself.
+# Where a sensor's value is; the board's own read-backs are changed after it, the camera separately.
 SAMPLED = {
     "laser": "displacement_um",
     "gauge": "gauge_pressure_pa",
@@ -45,7 +45,7 @@ SAMPLED = {
 READ_BACK = {"pump read-back": "pump_fraction", "vent read-back": "vent_fraction"}
 CAMERA = "camera"
 
-# the value now, the value when it set in, seconds since then: what is read
+# the value now, the value when the fault began, seconds since then: the reading
 Lie = Callable[[float, float, float], float]
 
 
@@ -57,11 +57,11 @@ class SensorFault:
     ----------
     sensor, failure : str
     lie : callable or None
-        What is read instead; none for a swap.
+        The reading instead; None for a swap.
     swapped_with : str
         The sensor whose value this one shows, and the other way round.
     lasts_s : float
-        How long it is watched.
+        How long it is monitored.
     """
 
     sensor: str
@@ -71,7 +71,7 @@ class SensorFault:
     lasts_s: float = 900.0
 
     def read(self, values: dict[str, float], first: dict[str, float], age_s: float) -> dict[str, float]:
-        """All that is read, from what is true."""
+        """All readings, from the truth."""
         if self.swapped_with:
             other = values.get(self.swapped_with, math.nan)
             return {**values, self.sensor: other, self.swapped_with: values[self.sensor]}
@@ -80,7 +80,7 @@ class SensorFault:
 
 
 class Lying:
-    """Which fault there is now, and since when; shared by plant, read-backs and camera of one bench."""
+    """The present fault, and since when; shared by plant, read-backs and camera of one bench."""
 
     def __init__(self, faults: Sequence[SensorFault]) -> None:
         self._faults = faults
@@ -92,7 +92,7 @@ class Lying:
         self._since_s = now_s
 
     def read(self, values: dict[str, float], now_s: float) -> dict[str, float]:
-        """What is read in place of these."""
+        """The readings instead of these."""
         if math.isnan(self._since_s):
             return values
         for name, value in values.items():
@@ -122,7 +122,7 @@ class LyingPlant(Plant):
         self._lying, self._linear = lying, linear
 
     def truth(self) -> Truth:
-        """What really is."""
+        """The true state."""
         truth = super().truth()
         if self._linear == 0.0:
             return truth
@@ -131,7 +131,7 @@ class LyingPlant(Plant):
         return replace(truth, gauge_pressure_pa=tense_pa)
 
     def sample_of(self, truth: Truth) -> BoardSample:
-        """What the sensors say of it."""
+        """The sensors' readings of it."""
         sample = super().sample_of(truth)
         values = {name: getattr(sample, field) for name, field in SAMPLED.items()}
         read = self._lying.read(values, truth.time_s)
@@ -178,12 +178,12 @@ def drift(per_s: float) -> Lie:
 
 
 def blocked(noise: float, seed: int = 1) -> Lie:
-    """It measures noise, and nothing else: a hose that is kinked, a plug that is loose."""
+    """It measures only noise: a kinked hose, a loose plug."""
     rng = np.random.default_rng(seed)
     return lambda value, first, age_s: first + noise * float(rng.standard_normal())
 
 
-# What takes an hour to show.
+# Failures that take an hour to show.
 SLOW = ("2 um/min", "-0.05 um/s", "-10 Pa an hour")
 UNITS = (10.0, 0.1, 1000.0, 0.001)
 
@@ -242,19 +242,19 @@ PAIRS: tuple[tuple[SensorFault, ...], ...] = (
 
 @dataclass(frozen=True)
 class Story:
-    """What came of one run.
+    """Result of one run.
 
     Attributes
     ----------
     noticed : str
-        Rule, or event, that first spoke after the fault had set in; empty: nothing did.
+        First rule or event after the fault began; empty: none.
     after_s : float
         How long after.
     ended_in : State
     pumped_um : float
-        How far the film rose above its setpoint while the pump could run; what a ramp takes is not counted.
+        How far the film rose above its setpoint while the pump could run; a ramp does not count.
     astray_um : float
-        Largest way of the true film from its setpoint in `hold`.
+        Largest distance of the true film from its setpoint in `hold`.
     pressure_max_pa : float
         Largest true gauge pressure since then.
     """
@@ -311,7 +311,7 @@ def _read_back(lying: Lying) -> Callable[[float, BenchReading], BenchReading]:
 
 
 class _Watch:
-    """Notes who spoke first, and how far the true film went."""
+    """Notes the first rule or notice, and how far the true film went."""
 
     def __init__(self, bench: VirtualBench, begins_s: float) -> None:
         self._bench, self._begins_s = bench, begins_s
@@ -339,7 +339,7 @@ class _Watch:
 
 
 def _speaks(event: events.Event) -> str:
-    """Who says so, if the event is a complaint."""
+    """The name of the rule or notice, if the event is one."""
     match event:
         case events.Fault():
             return event.name

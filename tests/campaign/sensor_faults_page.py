@@ -44,7 +44,7 @@ half of the nights have a camera. The other bench has a film 42 um thick that wa
 more than the configuration says; its gauge and barometer have twice the noise.
 """
 SHAPED = ("laser", "gauge", CAMERA)
-# Why what nothing notices does no harm, or who guards instead: by sensor and the beginning of the failure.
+# Why an unnoticed failure is harmless, or what protects instead: by sensor and beginning of the failure.
 NOTES: tuple[tuple[str, str, str], ...] = (
     (
         "laser",
@@ -85,7 +85,7 @@ NOTES: tuple[tuple[str, str, str], ...] = (
         "Below `shape.disagreement_max_um` (10 um) there is no verdict; the mirror is off by as much.",
     ),
 )
-_Job = tuple[str, int, bool, bool]  # what it is of, its number, with a camera, from the start
+_Job = tuple[str, int, bool, bool]  # kind, number, with a camera, from the start
 
 
 def jobs() -> Iterator[_Job]:
@@ -158,7 +158,7 @@ def _note(fault: SensorFault) -> str:
 
 
 def _quiet_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
-    """How often the guards cry without a cause."""
+    """How often the guards raise a false alarm."""
     nights: defaultdict[bool, list[QuietHours]] = defaultdict(list)
     for (what, _, _, other), cell in found.items():
         if what == "quiet_hours":

@@ -1,4 +1,4 @@
-"""Nights in which no sensor fails and much else happens: who raises an alarm then is wrong."""
+"""Nights in which no sensor fails and much else happens: any alarm is false."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.bench_events import (
     PressureWeather,
 )
 
-_DROPOUT = "displacement_missing"  # five seconds without light are no fault of the guards
+_DROPOUT = "displacement_missing"  # five seconds without light are a true alarm
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class QuietHours:
     ----------
     hours : float
     alarms : tuple of str
-        Faults that were told, with what was seen.
+        Reported faults, with what was seen.
     """
 
     hours: float
@@ -49,7 +49,7 @@ class QuietHours:
 def quiet_hours(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0) -> QuietHours:
     """Weather, doors, a leak that doubles, setpoints, inflations, a laser that drifts, with and without a camera.
 
-    The other world has another film (thinner, and stretched before it was inflated), a leak twice as large, a pump
+    The other bench has another film (thinner, and stretched before it was inflated), a leak twice as large, a pump
     that gives a quarter more than the configuration says, and sensors with twice the noise.
     """
     if not other_world:

@@ -1,4 +1,4 @@
-"""A systemd of its own to try the unit file in: real, but in namespaces that end with the test."""
+"""A separate systemd to test the unit file: real, but in namespaces that end with the test."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SOURCE = Path(__file__).parents[2]
 _UNIT = "membrane-ctrl"
 _UNITS = "/run/units"
 _PROGRAM = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
-# what an installed interpreter and an installed package would not need
+# not needed with an installed interpreter and package
 _PLACES = "Environment=LD_LIBRARY_PATH=/opt/python/lib PYTHONPATH=/opt/source"
 _SET_UP = f"""
 adduser --quiet --system --group --home /var/lib/membrane-ctrl membrane
@@ -36,7 +36,7 @@ systemctl start systemd-journald.service
 
 
 def missing() -> str:
-    """Why this machine has no room for it; empty if it has."""
+    """Why this machine cannot have one; empty if it can."""
     if not sys.platform.startswith("linux") or os.geteuid() != 0:
         return "needs Linux and root"
     if not Path("/lib/systemd/systemd").exists():
@@ -49,7 +49,7 @@ def missing() -> str:
 
 
 class Room:
-    """What runs in it.
+    """The processes in it.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Room:
         self._since = ""
 
     def run(self, script: str) -> str:
-        """What a shell script says in the room, as root. Raises CalledProcessError."""
+        """Output of a shell script in the room, as root. Raises CalledProcessError."""
         enter = ["nsenter", "-t", str(self._pid), "-m", "-p", "-C", "-u", "-i", "-n", "-r", "-w"]
         done = subprocess.run(
             [*enter, "bash", "-euc", script], capture_output=True, text=True, timeout=120, check=True
@@ -106,12 +106,12 @@ class Room:
         self.run(f"kill -{int(number)} {self.main_pid}")
 
     def log(self) -> str:
-        """What the service and systemd have said of it since it was fresh."""
+        """Messages of the service and of systemd since it was fresh."""
         since = f"--since '{self._since}'" if self._since else ""
         return self.run(f"journalctl -u {_UNIT} -o cat --no-pager {since}")
 
     def survivors(self) -> list[str]:
-        """Processes that the service has left behind."""
+        """Processes that the service left behind."""
         return self.run(f"cat /sys/fs/cgroup/system.slice/{_UNIT}.service/cgroup.procs 2> /dev/null || true").split()
 
     def until(self, what: Callable[[], bool], patience_s: float = 60.0) -> None:
@@ -164,7 +164,7 @@ def _remove_branch(branch: str) -> None:
     top = tree / branch.strip("/")
     if not branch.strip("/") or not top.name.startswith("membrane-room-"):
         return
-    for _ in range(50):  # a killed process leaves its group a moment later
+    for _ in range(50):  # a killed process leaves its group shortly after
         for folder in sorted((f for f in top.rglob("*") if f.is_dir()), reverse=True):
             try:
                 folder.rmdir()

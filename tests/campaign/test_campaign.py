@@ -1,4 +1,4 @@
-"""A part of the fault campaign with every run of the tests; the whole by `make campaign`."""
+"""A part of the fault campaign in every test run; `make campaign` runs all of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`calibrate --live` beside a hold with real processes whose bench stands otherwise than its configuration says."""
+"""`calibrate --live` beside a hold with real processes whose bench differs from its configuration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1
 
 COMMAND = [sys.executable, "-m", "membrane_ctrl"]
 PATIENCE_S = 600.0
-# A mirror that loses and gets gas twenty times as fast as a real one, and frames of an eighth
+# A mirror that loses and gains gas twenty times as fast as a real one, and frames of an eighth
 CONFIG = """
 [twin]
 port = 0
@@ -96,7 +96,7 @@ def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
         assert found[name]["sigma"] < 0.8 * known, name
     new = read_geometry(logs.parent / "bench.toml")
     assert new.origin.hash == json.loads(done.stdout)["hash"]
-    assert new.geometry.reference_displacement_um == 0.0  # the setpoint it was held at
+    assert new.geometry.reference_displacement_um == 0.0  # the setpoint of the hold
     events = told(logs)
     assert [event["verdict"] for event in events if event["kind"] == "capture"] == ["ok"] * 3
     assert not [event for event in events if event["kind"] in ("fault", "plausibility")]

@@ -57,7 +57,7 @@ async def test_the_tick_is_not_disturbed_and_a_stop_gets_through(tmp_path: Path)
         assert await run.ended() == Exit.INTERRUPTED
         assert run.faults() == []
         refused = [event for event in run.events if event["kind"] == "refused"]
-        assert 10 <= len(refused) <= 100  # recorded, and what is recorded bounded
+        assert 10 <= len(refused) <= 100  # recorded, and the record is bounded
         assert any("bytes" in event["reason"] for event in refused)
     figures = figures_of(tmp_path)
     assert figures["fault_count"] == 0

@@ -1,4 +1,4 @@
-"""What can only go wrong with real processes and sockets: stopped, killed, cut off, without room, two at once."""
+"""Faults that need real processes and sockets: stopped, killed, cut off, without disk space, two at once."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def wait_for_event(folder: Path, patience_s: float, **words: object) -> None:
 def test_the_hold_goes_on_without_its_camera_until_another_takes_its_place(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    """The process that owns screen and camera dies, or stands until its 60 s are over."""
+    """The process that owns screen and camera dies, or is stopped until its 60 s are over."""
     (tmp_path / "lab.toml").write_text(CAMERA)
     words = ("--twin", "--config", str(tmp_path / "lab.toml"), "--logs", str(tmp_path / "logs"))
     with subprocess.Popen([sys.executable, "-m", "membrane_ctrl", "hold", *words], stderr=subprocess.DEVNULL) as hold:

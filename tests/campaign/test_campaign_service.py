@@ -16,7 +16,7 @@ RUNS = "/var/lib/membrane-ctrl/logs"
 LATCHED = f"{RUNS}/latched-fault.json"
 PLACES = "PYTHONPATH=/opt/source LD_LIBRARY_PATH=/opt/python/lib"
 SOCKET = f"--socket {RUNS}/control.sock"
-# Apprise need not be installed here: what it would be told goes into a file
+# Apprise need not be installed here: its notices go to a file
 APPRISE = """
 class _Target:
     def notify(self, title, body, notify_type):
@@ -49,7 +49,7 @@ def runs(room: Room) -> list[str]:
 
 
 def ctl(room: Room, who: str, words: str) -> str:
-    """What a person of the lab is told."""
+    """The answer to a person of the lab."""
     program = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
     as_who = f"setpriv --reuid {who} --regid {who} --init-groups"
     return room.run(f"cd /; {PLACES} {as_who} {program} ctl {words} {SOCKET} 2>&1 || true")

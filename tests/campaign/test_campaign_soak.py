@@ -1,4 +1,4 @@
-"""What days of simulated weather have to keep: the true centre in its bands, and memory flat."""
+"""Demands on days of simulated weather: the true centre in its bands, and memory flat."""
 
 from __future__ import annotations
 

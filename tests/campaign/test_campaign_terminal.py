@@ -1,4 +1,4 @@
-"""A hold on a terminal: its screen hangs or dies, the terminal is closed, and the mirror does not care."""
+"""A hold on a terminal: the console hangs or dies, or the terminal is closed, without effect on the mirror."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Terminal:
     def _read(self) -> None:
         try:
             self.seen += os.read(self._ours, 1 << 16)
-        except OSError:  # who was on it has left
+        except OSError:  # the process on it has left
             asyncio.get_running_loop().remove_reader(self._ours)
 
     def press(self, key: bytes) -> None:
@@ -55,7 +55,7 @@ class Terminal:
 
 @asynccontextmanager
 async def on_terminal(folder: Path) -> AsyncIterator[tuple[Run, Terminal]]:
-    """A hold on a terminal of its own, under way."""
+    """A running hold on its own terminal."""
     terminal = Terminal()
     try:
         async with running(

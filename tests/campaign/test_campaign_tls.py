@@ -1,6 +1,6 @@
 """A hold whose TLS port is under attack: no tick is missed, and operators from elsewhere are served.
 
-Peace and attack come in turn, in one hold, so that the lateness of the one is compared with that of the other.
+Phases without and with the attack alternate in one hold, so that their lateness can be compared.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from port_certificates import Authority
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(400)]
 
-CYCLES, WARM_S, PHASE_S = 5, 4.0, 12.0  # attackers need some seconds until all of them are there
-CROWD = 1000  # who never shake hands; 98 others do worse
+CYCLES, WARM_S, PHASE_S = 5, 4.0, 12.0  # attackers need some seconds until all are connected
+CROWD = 1000  # these never complete a handshake; 98 others do worse
 
 
 @dataclass
 class Operator:
-    """Asks again and again, each time by a new connection, and notes what came of it."""
+    """Asks again and again, each time with a new connection, and notes the results."""
 
     ask: Callable[[str], dict[str, Any]]
     served_s: list[float] = field(default_factory=list)
@@ -63,7 +63,7 @@ class Operator:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the bench, of an operator, and of those whom nobody wants."""
+    """Of the bench, of an operator, and of attackers."""
     folder = tmp_path_factory.mktemp("tls")
     lab, stranger = Authority.new(folder / "lab"), Authority.new(folder / "stranger")
     lab.certificate("bench")
@@ -115,7 +115,7 @@ class Phase:
 
 
 async def phases_of(run: Run, how: str, certificates: Path, port: int) -> list[Phase]:
-    """Peace and attack in turn: what the machine does besides is in both."""
+    """Phases without and with the attack in turn: both contain the machine's other work."""
     control = psutil.Process(run.process.pid)
     start = run.events[0]
     zero_s = datetime.fromisoformat(start["time_utc"]).timestamp() - start["mono_s"]
@@ -180,12 +180,12 @@ async def test_strangers_disturb_neither_ticks_nor_operators(tmp_path: Path, cer
     assert mean(p.busy for p in attack) < mean(p.busy for p in peace) + 0.05  # the machine's load does not show in it
     ticks = 50 * CYCLES * PHASE_S
     assert sum(p.missed for p in attack) <= max(3 * sum(p.missed for p in peace), ticks // 20)
-    assert grown_mb < 120.0  # five attacks: 80 MB were seen; one alone: 53 MB
+    assert grown_mb < 120.0  # seen: 80 MB in five attacks, 53 MB in one
     assert files < 200
     assert len(refused) <= 40 * CYCLES
     assert local.failed == []
     assert len(local.served_s) >= 10
-    if how == "lone":  # a thousand addresses fill the queue of the kernel: then the socket file is the way
+    if how == "lone":  # a thousand addresses fill the kernel's queue: then the socket file works
         assert remote.failed == []
         assert len(remote.served_s) >= 10
 

@@ -1,4 +1,4 @@
-"""Sensors that lie, judged by the plant: the worst of them in every test run, the whole table in the campaign."""
+"""Lying sensors, judged by the plant: the worst in every test run, all of them in the campaign."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strangers at the TLS port, and insiders that misbehave: each comes again when thrown out, until it is killed."""
+"""Strangers at the TLS port, and misbehaving insiders: each reconnects when thrown out, until it is killed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def hello() -> bytes:
 
 
 async def stand(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
-    """Half a handshake: say nothing, for ever."""
+    """Half a handshake, then nothing for ever."""
     await reader.read()
 
 
@@ -114,6 +114,6 @@ async def everything(port: int, folder: Path, crowd: int, lone: bool) -> None:
     )
 
 
-if __name__ == "__main__":  # a process of its own, and behind the bench's: it is the port that is on trial
+if __name__ == "__main__":  # a separate process with a lower priority than the bench: the port is under test
     os.nice(10)
     asyncio.run(everything(int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "lone"))

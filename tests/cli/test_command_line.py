@@ -1,4 +1,4 @@
-"""The command line as a whole: what it loads, and how what nobody foresaw ends."""
+"""The command line as a whole: what it loads, and how unforeseen errors end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`check` says where a hold could be asked and who would be told, and refuses what a hold would refuse."""
+"""`check` names the control port and the alarms' targets, and refuses what a hold would refuse."""
 
 from __future__ import annotations
 

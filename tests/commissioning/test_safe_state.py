@@ -1,4 +1,4 @@
-"""`safe` stops the pump whoever has the board, takes nothing from him, and leaves it to a person to go on."""
+"""`safe` stops the pump whoever has the board, takes no claim, and leaves clearing to a person."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STOPPED, WATCHDOG = 0b100, 0b001
 
 
 class Still:
-    """A plant on which nothing happens."""
+    """An idle plant."""
 
     def sample(self) -> BoardSample:
         return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, 21.0, 1, 0.0)
@@ -158,7 +158,7 @@ def test_a_pump_that_the_watchdog_leaves_on_is_stopped_after_all(
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.commissioning.safe._LOOK_S", 0.001)
     monkeypatch.setattr("membrane_ctrl.commissioning.safe._LAPSE_S", -0.45)
-    assert make_safe(bench.config, "lab.toml", latch=False) == 0  # its clock stands: no watchdog trips
+    assert make_safe(bench.config, "lab.toml", latch=False) == 0  # its clock is stopped: no watchdog trips
     assert (bench.read().pump_fraction, bench.read().latched_faults) == (0.0, STOPPED)
 
 
@@ -193,7 +193,7 @@ def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> N
 
 
 class Hold:
-    """Listens as a hold's control port does, and says what it was asked."""
+    """Listens like a hold's control port, and keeps the requests."""
 
     def __init__(self, path: Path, answer: dict[str, object], ticks: Callable[[], None] = lambda: None) -> None:
         self._ticks = ticks
@@ -220,7 +220,7 @@ class Hold:
 
 
 def composed(folder: Path) -> Config:
-    """A bench of instruments of which none is there."""
+    """A bench of instruments, all absent."""
     roles = {
         "displacement": {"driver": "optoncdt1420", "port": f"{folder}/laser"},
         "pump": {"driver": "ventus", "port": f"{folder}/pump"},
@@ -264,7 +264,7 @@ def test_the_hold_is_told_also_where_the_board_latches(bench: Bench, tmp_path: P
 def test_an_old_board_is_stopped_once_more_after_the_hold_was_told(
     bench: Bench, version: int, tmp_path: Path
 ) -> None:
-    """Its last command before it latched came after the first stop."""
+    """The hold's last command before it latched came after the first stop."""
     hold = Hold(tmp_path / "control.sock", {"ok": True}, ticks=lambda: bench.write(0.5))
     make_safe(bench.config, "lab.toml")
     hold.close()

@@ -1,4 +1,4 @@
-"""Bad configuration is refused in one line that names the file, the field and what would be right."""
+"""Bad configuration is refused in one line that names the file, the field and a valid value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a configuration names is looked for beside it, wherever a command is called."""
+"""Files that a configuration names are beside it, wherever a command is called."""
 
 from __future__ import annotations
 

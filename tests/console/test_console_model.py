@@ -1,4 +1,4 @@
-"""What the console remembers of what it is sent."""
+"""What the console remembers of its input."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def read_until(handle: int, words: bytes, seen: bytes = b"") -> bytes:
 
 
 def finish(process: multiprocessing.process.BaseProcess, handle: int) -> bytes:
-    seen = read_until(handle, b"\x1b[?1049l")  # the first page of the terminal is back
+    seen = read_until(handle, b"\x1b[?1049l")  # the terminal's own page is back
     process.join(PATIENCE_S)
     assert process.exitcode == 0
     return seen

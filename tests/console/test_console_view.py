@@ -1,4 +1,4 @@
-"""What is on the console, and that it fits."""
+"""The console's content, and that it fits."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def test_outside_the_band_says_which_way_and_what_is_done() -> None:
     assert line(error_um=6.9, flow_um_per_s=5.3, flow_wanted_um_per_s=9.0) == (
         "outside the band: bowl 6.9 um too shallow, pump gives 5.30 um/s, its limit"
     )
-    assert line(error_um=2.0) == line(error_um=0.0)  # on the edge is inside
+    assert line(error_um=2.0) == line(error_um=0.0)  # the edge is inside
 
 
 def test_ladder_names_its_fault() -> None:

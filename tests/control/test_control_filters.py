@@ -10,7 +10,7 @@ from membrane_ctrl.control.filters import LagRate, LowPass, smoothing
 
 
 def test_smoothing_composes_over_steps() -> None:
-    """Two steps leave what one step of their sum leaves."""
+    """Two steps equal one step of their sum."""
     assert (1 - smoothing(0.3, 2.0)) * (1 - smoothing(0.5, 2.0)) == pytest.approx(1 - smoothing(0.8, 2.0))
 
 

@@ -67,7 +67,7 @@ def test_after_a_long_gap_the_reading_is_believed() -> None:
 
 
 def test_rate_is_believed_for_one_memory() -> None:
-    """A bump that is taken for a drift must not run away while nobody looks."""
+    """A bump taken for a drift must not run away while there are no readings."""
     tracker = DriftTracker(MEMORY_S)
     tracker.begin(0.0)
     for k in range(1, 400):

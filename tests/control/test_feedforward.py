@@ -1,4 +1,4 @@
-"""Feed-forward: sign, size, and coming and going."""
+"""Feed-forward: sign, size, and sensors that come and go."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def answered(loop: LoopConfig, pressure_pa: np.ndarray, air_c: np.ndarray) -> np
 
 
 def test_pressure_step_is_made_good() -> None:
-    """+20 Pa press the bowl flat by 7.16 um; the pump is told to add as much."""
+    """+20 Pa flatten the bowl by 7.16 um; the feed-forward adds as much."""
     pressure_pa = np.where(np.arange(1000) < 10, 101_325.0, 101_345.0)
     flow = answered(LoopConfig(), pressure_pa, np.full(1000, 20.0))
     assert flow.sum() * DT_S == pytest.approx(20 * 0.358)
@@ -45,7 +45,7 @@ def test_switched_off() -> None:
 
 @pytest.mark.parametrize("lost", ["pressure", "temperature"])
 def test_sensor_that_comes_and_goes_is_no_bump(lost: str) -> None:
-    """However far the value went while nobody saw it."""
+    """However far the value went meanwhile."""
     ramp = np.arange(600) * DT_S
     pressure_pa, air_c = 101_325.0 + 1.0 * ramp, 20.0 + 0.01 * ramp
     series = pressure_pa if lost == "pressure" else air_c

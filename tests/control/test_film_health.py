@@ -1,4 +1,4 @@
-"""What gets worse over days is told ahead, once, and peace is not disturbed."""
+"""Slow deterioration is announced early, once; good days bring no warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laser, gauge and gas: what parts them is told in a stated time; weather, ramps, drift and another film are not."""
+"""Laser, gauge and gas: disagreement is reported in a stated time; weather, ramps, drift and another film are not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmMonitor, LeakGrowt
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-# time -> true way of the film and the laser's lie, um; the gauge's lie, Pa; the shape loop's trim, um
+# time -> true motion of the film and the laser's error, um; the gauge's error, Pa; the shape loop's trim, um
 Story = Callable[[float], tuple[float, float, float, float]]
 Law = Callable[[float], float]
 
@@ -36,7 +36,7 @@ def told(
     rate_hz: float = RATE_HZ,
     seed: int = 1,
 ) -> tuple[str, float]:
-    """What is said first, and when; noise 1 um and 0.5 Pa."""
+    """The first report, and when; noise 1 um and 0.5 Pa."""
     rng = np.random.default_rng(seed)
     monitor = FilmMonitor(LimitsConfig(), mirror or MirrorConfig())
     for tick in range(round(duration_s * rate_hz)):
@@ -112,7 +112,7 @@ def test_a_long_way_is_no_lie_whatever_the_film(law: Law, speed_um_per_s: float)
 
 @pytest.mark.parametrize("law", [hencky, tense])
 def test_a_way_there_and_back_is_no_lie(law: Law) -> None:
-    # the reference is a mean over the way: of a curved law it lies on no place of the film
+    # the reference is a mean over the motion: with a curved law it is no point of the film's curve
     assert told(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[0] == ""
 
 
@@ -193,7 +193,7 @@ def test_what_it_used_to_take_is_learnt_only_after_the_ramps_mean_is_over() -> N
 
 def test_a_leak_that_grows_slowly_is_told_when_it_has_grown_too_far() -> None:
     at_s = grown(lambda t: 1.2 + t / 600, 2.2, 7200)
-    assert 2.2 * 1.2 < 1.2 + at_s / 600 < 4.5  # what it used to take is a mean over an hour
+    assert 2.2 * 1.2 < 1.2 + at_s / 600 < 4.5  # the former consumption is a mean over an hour
 
 
 def test_bursts_do_not_add_up() -> None:
@@ -212,7 +212,7 @@ def test_a_thermometer_that_lies_takes_no_gas_and_a_room_that_cools_takes_what_i
 
 
 def test_what_it_used_to_take_is_no_matter_of_a_gust() -> None:
-    # the pump gives little while the hold begins, and no more than the leak ever after
+    # the pump gives little while the hold begins, and afterwards no more than the leak
     assert math.isnan(grown(lambda t: 1.24, CONTRADICTED_MOST, 3600, lambda t: 0.3 if t < 100 else 1.24))
 
 

@@ -23,7 +23,7 @@ def given_at(displacement_um: float, target_um: float = 0.0, trim_um: float = 0.
 def settled(
     loop: LoopConfig = LOOP, displacement_um: float = 0.0, flow: float = 1.24
 ) -> tuple[InnerLoop, LoopOutput]:
-    """A loop that stands at its setpoint and needs this flow."""
+    """A loop at its setpoint that needs this flow."""
     inner = InnerLoop(loop, PUMP)
     inner.start(displacement_um, flow)
     for _ in range(100):
@@ -41,7 +41,7 @@ def test_start_is_at_the_reading_and_the_flow() -> None:
 
 
 def test_start_with_a_trim_is_at_the_reading_too() -> None:
-    """After a restart of the loop the held trim is part of where the mirror stands."""
+    """After a restart of the loop the held trim is part of the mirror's position."""
     inner = InnerLoop(LOOP, PUMP)
     inner.start(7.0, 1.24)
     out = inner.step(given_at(7.0, target_um=0.0, trim_um=7.0), DT_S)

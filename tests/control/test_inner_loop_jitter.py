@@ -1,4 +1,4 @@
-"""Ticks that come early, late or not at all: the loop is given the true time step."""
+"""Ticks that come early, late or not at all: the loop gets the true time step."""
 
 from __future__ import annotations
 

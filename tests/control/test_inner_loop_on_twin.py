@@ -1,6 +1,6 @@
 """The inner loop on the twin: what the mirror's centre truly does, in virtual time.
 
-The bounds are the project's requirements, not what is reached (docs/control.md has that).
+The bounds are the project's requirements; docs/control.md has the achieved figures.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def test_doubled_leak_stays_in_the_band() -> None:
 
 @pytest.mark.parametrize("change_pa", [20.0, -20.0])
 def test_door(change_pa: float) -> None:
-    """7 um at once, which nothing prevents; then back as fast as pump or leak allow, without wind-up."""
+    """7 um at once, which nothing can prevent; then back as fast as pump or leak allow, without wind-up."""
     figures = answer(ALL, AmbientChange(60.0, change_pa), SEEDS, 2.0)
     assert 6.5 < figures["worst_peak_um"] < 8.0
     assert figures["back_s"] < 8.0
@@ -94,7 +94,7 @@ def test_leak_estimate_finds_the_truth() -> None:
     ids=str,
 )
 def test_other_settings_hold_too(change: dict[str, float]) -> None:
-    """A loop this mild must not depend on its fine print."""
+    """A loop this mild must not depend on details."""
     held = hold(LoopConfig(**change), TwinConfig(start_error_um=0.0), 100.0)
     assert held.after(40.0).std() < 0.35
     assert abs(held.after(40.0).mean()) < 0.1
@@ -111,7 +111,7 @@ def test_other_settings_hold_too(change: dict[str, float]) -> None:
     ids=["weak", "strong", "early", "sticky"],
 )
 def test_pump_it_was_not_told_of(true_pump: PumpConfig) -> None:
-    """The integrator makes good what the pump curve gets wrong."""
+    """The integrator corrects the pump curve's error."""
     held = hold(LoopConfig(), TwinConfig(start_error_um=-10.0), 100.0, true_pump=true_pump)
     assert held.after(40.0).std() < 0.25
     assert abs(held.after(40.0).mean()) < 0.1

@@ -13,7 +13,7 @@ DT_S = 0.02
 
 
 def run(estimate: LeakEstimate, leak: float, seconds: float, flow: float = 1.0, weather: float = 0.0) -> None:
-    """A mirror that moves by what flow, leak and weather (um/s) leave, read with the filtered noise of the laser."""
+    """A mirror that moves by the balance of flow, leak and weather (um/s), read with the laser's filtered noise."""
     estimate.pause()  # the centre of each run starts at 0
     rng, centre_um = np.random.default_rng(3), 0.0
     for _ in range(round(seconds / DT_S)):
@@ -54,7 +54,7 @@ def test_too_tight_is_judged_late_and_with_hysteresis() -> None:
 
 
 def test_gap_is_left_out() -> None:
-    """What the centre did while nobody looked is no rate."""
+    """Motion of the centre during the gap is no rate."""
     estimate = LeakEstimate()
     run(estimate, 1.0, 60.0)
     estimate.pause()

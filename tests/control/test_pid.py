@@ -63,7 +63,7 @@ def test_no_wind_up(error_um: float) -> None:
 
 
 def test_back_calculation_settles_at_the_limit() -> None:
-    """Pushed up for ever, P + I exceeds the limit by just K e: back-calculation and integral action balance there."""
+    """Pushed up for ever, P + I exceeds the limit by K e: there back-calculation and integral action balance."""
     pid = Pid(PidGains(0.61, 6.5, 0.0), V_MAX)
     for _ in range(10_000):
         pid.terms(2.0, 0.0)
@@ -82,7 +82,7 @@ def test_back_calculation_goes_to_the_limit_with_the_integral_time(error_um: flo
 
 
 def test_what_is_placed_is_the_whole_output_until_the_next_error() -> None:
-    """An error of before, of another state, must not come back by way of a change of gains."""
+    """An earlier error, of another state, must not return with a change of gains."""
     pid = Pid(PidGains(0.5, 4.0, 0.5), V_MAX)
     pid.terms(3.0, 1.0)
     pid.place(1.0)

@@ -1,4 +1,4 @@
-"""Who lies is found by the third sensor, in a time and from a size that are stated; nobody is accused in peace."""
+"""The third sensor finds the wrong one, within a stated time and from a stated size; no false accusation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's lie, camera's lie; um
+Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's error, camera's error; um
 
 
 def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
@@ -24,7 +24,7 @@ def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate
 
 
 def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0) -> list[Liar]:
-    """What is said on every tick of a story; noise 1 um, 1 um and 0.5 Pa."""
+    """The verdict on every tick of a story; noise 1 um, 1 um and 0.5 Pa."""
     rng = np.random.default_rng(seed)
     judge, said = PlausibilityCheck(10.0), []
     for tick in range(round(duration_s * RATE_HZ)):
@@ -50,7 +50,7 @@ def test_in_peace_nobody_is_accused(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
 def test_a_laser_that_was_knocked_is_found_within_a_minute(size_um: float, seed: int) -> None:
-    # the loop brings the reading back to its setpoint, and the mirror off its place
+    # the loop returns the reading to its setpoint, and moves the mirror off it
     said = told(lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed)
     found = said.index(Liar.LASER) / RATE_HZ
     assert 200.0 < found < 260.0
@@ -107,7 +107,7 @@ def shown(judge: PlausibilityCheck, time_s: float, laser_um: float, camera_um: f
 
 
 def settled(laser_um: float, camera_um: float, gauge_um: float) -> tuple[PlausibilityCheck, float]:
-    """Who has seen peace for a minute and then this for a minute."""
+    """A monitor after a minute without error and a minute of this."""
     judge, time_s = PlausibilityCheck(10.0), 0.0
     for _ in range(60):
         time_s += 1.0
@@ -121,7 +121,7 @@ def settled(laser_um: float, camera_um: float, gauge_um: float) -> tuple[Plausib
 def test_who_is_found_stays_accused_whatever_the_gauge_says_then() -> None:
     judge, time_s = settled(30.0, 0.0, 0.0)
     assert judge.liar == Liar.LASER
-    for second in range(1, 121):  # the gauge goes over to the laser's story
+    for second in range(1, 121):  # the gauge now agrees with the laser
         assert shown(judge, time_s + second, 30.0, 0.0, 30.0) == Liar.LASER
 
 
@@ -138,6 +138,6 @@ def test_who_is_found_is_believed_again_only_below_half_the_limit() -> None:
 def test_two_that_part_with_the_gauge_between_them_leave_it_unsure() -> None:
     judge, time_s = settled(20.0, 0.0, 10.0)
     assert judge.liar == Liar.UNSURE
-    for second in range(1, 121):  # it is not settled: a gauge that speaks later is heard
+    for second in range(1, 121):  # it is not settled: a later verdict of the gauge counts
         said = shown(judge, time_s + second, 20.0, 0.0, 0.0)
     assert said == Liar.LASER

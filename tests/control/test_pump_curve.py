@@ -16,7 +16,7 @@ DT_S = 0.02
 
 
 def delivered(flows_um_per_s: list[float]) -> np.ndarray:
-    """What the twin's pump makes of the commands, um/s, one value a tick."""
+    """Flow of the twin's pump for the commands, um/s, one value a tick."""
     curve, pump, out = PumpCurve(PUMP), PumpModel(PUMP, PUMP.flow_full_um_per_s, 0.005), []
     for flow in flows_um_per_s:
         command = curve.command(flow, DT_S)

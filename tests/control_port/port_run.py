@@ -1,4 +1,4 @@
-"""A run to put a port on: ticks that answer at once, and clients that are who the test says."""
+"""A run for a port: ticks that answer at once, and clients with names from the test."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROW = replace(TelemetryRow(*(0.0 for _ in FIELDS)), mono_s=12.0, tick=600.0, sta
 
 
 class NamedListener(UnixListener):
-    """Lets the test say who comes next."""
+    """The test names the next client."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, None, "operate")
@@ -39,7 +39,7 @@ class NamedListener(UnixListener):
 
 
 class PortRun:
-    """A port whose commands are taken up by a tick as soon as the loop turns, or never (`ticking`)."""
+    """A port whose commands a tick takes at the loop's next round, or never (`ticking`)."""
 
     def __init__(self, folder: Path, config: PortConfig | None = None) -> None:
         self.config = Config()
@@ -129,7 +129,7 @@ class LineClient:
                 return message
 
     async def gone(self) -> bool:
-        """The other side has hung up."""
+        """Wait until the other side hangs up."""
         with suppress(ConnectionError):
             while await self.get() is not None:
                 pass

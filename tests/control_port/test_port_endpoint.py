@@ -1,4 +1,4 @@
-"""Who does not come in: half a handshake, a crowd, a flood. Another address gets in all the same."""
+"""Who is kept out: half a handshake, a crowd, a flood. Another address still gets in."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ Crowd = list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]
 
 @contextlib.asynccontextmanager
 async def strangers(run: PortRun, addresses: list[str]) -> AsyncIterator[Crowd]:
-    """Connections that never say a word, one from each address."""
+    """Silent connections, one from each address."""
     crowd: Crowd = []
     try:
         for address in addresses:
-            with contextlib.suppress(ConnectionError):  # turned away before it was through
+            with contextlib.suppress(ConnectionError):  # refused before it was connected
                 crowd.append(await asyncio.open_connection(*address_of(run), local_addr=(address, 0)))
             await asyncio.sleep(0)
         yield crowd
@@ -53,7 +53,7 @@ async def strangers(run: PortRun, addresses: list[str]) -> AsyncIterator[Crowd]:
 
 
 async def dropped(crowd: Crowd, at_least: int) -> None:
-    """Wait until so many have been hung up on."""
+    """Wait until so many are dropped."""
     reads = [asyncio.create_task(reader.read()) for reader, _ in crowd]
     try:
         async with asyncio.timeout(10):
@@ -73,7 +73,7 @@ async def dropped(crowd: Crowd, at_least: int) -> None:
 async def test_who_does_not_shake_hands_keeps_nobody_out(
     addresses: list[str], tmp_path: Path, lab: Authority, config: PortConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.protocol._HANDSHAKE_S", 60.0)  # none of them goes by itself
+    monkeypatch.setattr("membrane_ctrl.control_port.protocol._HANDSHAKE_S", 60.0)  # none of them times out
     pair = lab.certificate(f"ann{len(set(addresses))}", "operate")
     async with port_run(tmp_path, config) as run, strangers(run, addresses) as crowd:
         greeting = await asyncio.to_thread(greet, run, pair, lab.own)
@@ -94,7 +94,7 @@ async def test_newcomers_of_the_strangers_own_address_get_in_too(
 async def test_who_has_shaken_hands_is_no_stranger_any_more(
     tmp_path: Path, lab: Authority, config: PortConfig
 ) -> None:
-    """Sessions of one address beyond the number of strangers stay."""
+    """Sessions of one address beyond the limit for strangers stay."""
     pairs = [lab.certificate(f"member{n}", "read") for n in range(6)]
     async with port_run(tmp_path, config) as run:
 

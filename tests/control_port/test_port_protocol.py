@@ -86,7 +86,7 @@ def test_a_wrong_request_is_answered_by_its_number() -> None:
 
 
 def test_the_longest_words_fit_an_event() -> None:
-    """What JSON makes of them, in an event with everything else that a command's event holds."""
+    """As JSON, in an event with everything else that a command's event holds."""
     worst = "\U0001f9ca"
     request = parse(line(do="mark", text=worst * (TEXT_BYTES // 4), why=worst * (WHY_BYTES // 4)))
     who = "é" * (WHO_BYTES // 2)
@@ -107,7 +107,7 @@ fields = st.dictionaries(st.sampled_from([*Request.model_fields, "other"]), valu
 
 
 def outcome(data: bytes) -> str:
-    """The action asked for, or why there is none."""
+    """The requested action, or why there is none."""
     try:
         return parse(data).do
     except RequestError as refused:

@@ -1,4 +1,4 @@
-"""The port over its socket file: who may what, and what a bad client can do (nothing)."""
+"""The port over its socket file: who may do what, and what a bad client can do (nothing)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mutual TLS with real certificates: who has none, an old one or a stranger's stays out."""
+"""Mutual TLS with real certificates: clients with none, an old one or a stranger's stay out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the children report reaches those who ask, beside what the ticks decide."""
+"""Clients get the children's reports besides the ticks' decisions."""
 
 from __future__ import annotations
 

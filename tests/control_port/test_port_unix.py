@@ -72,7 +72,7 @@ def test_a_living_holds_socket_is_refused_and_left_alone(tmp_path: Path) -> None
 
 
 def test_a_hanging_holds_socket_is_busy_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its queue is full, and a connection waits: no reason to take its place."""
+    """Its queue is full and a connection waits: still no reason to replace it."""
     monkeypatch.setattr("membrane_ctrl.control_port.sockets._SOMEBODY_THERE_S", 0.05)
     path = tmp_path / "control.sock"
     hanging = socket.socket(socket.AF_UNIX)

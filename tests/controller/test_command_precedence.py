@@ -49,7 +49,7 @@ def command(kind: Kind) -> Command:
 
 
 class Mirror:
-    """A controller with a bench on which all is well, unless it is told otherwise."""
+    """A controller with a bench without faults, unless given."""
 
     def __init__(self) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
@@ -104,7 +104,7 @@ def in_state(state: State) -> Mirror:
 
 
 def stays_down(mirror: Mirror) -> None:
-    """Whatever is asked for except `ack`, again and again, the pump stays off."""
+    """Whatever is commanded except `ack`, again and again, the pump stays off."""
     assert mirror.last is not None
     assert mirror.last.command.pump_fraction == 0.0
     for kind in ("hold", "manual", "resume", "lower", "hold", "hold", "hold", "hold"):
@@ -137,7 +137,7 @@ def orders(*kinds: Kind) -> set[tuple[Kind, ...]]:
     "state", [State.STANDBY, State.HOLD, State.MANUAL, State.FAULT], ids=lambda state: state.name
 )
 def test_after_a_latch_an_ack_of_its_own_tick_lets_the_mirror_be_held_again(state: State) -> None:
-    """What the tests above would not see: a controller that never inflates again."""
+    """The tests above would not notice a controller that never inflates again."""
     mirror = in_state(state)
     mirror.tick("latch", "ack")
     for _ in range(10):

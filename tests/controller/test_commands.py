@@ -1,4 +1,4 @@
-"""What a command is refused for, before anything is done."""
+"""Why commands are refused, before anything is done."""
 
 from __future__ import annotations
 

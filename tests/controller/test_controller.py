@@ -1,4 +1,4 @@
-"""The whole tick on the twin in virtual time: states, safe actions, and what a person is told."""
+"""The whole tick on the twin in virtual time: states, safe actions, and the messages."""
 
 from __future__ import annotations
 

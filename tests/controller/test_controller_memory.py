@@ -1,4 +1,4 @@
-"""A controller's memory: a replay that begins with it is the same to the last bit; what is none is refused."""
+"""A controller's memory: a replay that begins with it is identical to the last bit; anything else is refused."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ _SCRAPS = (
 
 
 def test_a_tick_that_raises_after_a_forged_memory_is_the_memorys_fault() -> None:
-    memory = with_value("_safety._history", [0])  # as many as rules, a true one has
+    memory = with_value("_safety._history", [0])  # a valid one has as many as there are rules
     inputs, outputs = TICKS[MIDDLE - 1]
     with pytest.raises(UnknownMemoryError, match="cannot be used: IndexError at 13"):
         replay(CONFIG, [RecordedTick(MIDDLE, inputs, 0, memory)], zernike_projection())

@@ -1,4 +1,4 @@
-"""The whole configuration against itself and the board: each danger is named, and its sound neighbour is not."""
+"""The whole configuration against itself and the board: each dangerous value is named, its sound neighbour passes."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def test_every_finding_is_a_line_and_nothing_is_made(
 
 
 class StillPlant:
-    """A mirror that stands."""
+    """A mirror that does not move."""
 
     def __init__(self) -> None:
         self.outputs: list[float] = []

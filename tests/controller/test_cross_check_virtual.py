@@ -1,4 +1,4 @@
-"""Random configurations, and the simulated mirror as judge: what the cross-check lets pass holds, and ends safely.
+"""Random configurations, judged by the simulated mirror: those that the cross-check passes hold, and end safely.
 
 The judge's limits are its own, not the configuration's: seen from outside, by the true height and the true pump.
 """
@@ -25,7 +25,7 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 SENSITIVITY = zernike_projection()
-# what a draw may do to a default: times these, or one of these
+# how a draw changes a default: times these, or one of these
 FACTORS: dict[str, tuple[float, ...]] = {
     "loop.kp_per_s": (0.3, 0.5, 2.0, 5.0, 12.0),
     "loop.ti_s": (0.03, 0.2, 0.5, 3.0),
@@ -60,7 +60,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 }
 EVENTS = ("no_light", "unreachable", "stalled", "laser_stuck", "silent")
 SETTLED_S, AFTER_S = 45.0, 135.0  # HOLD_FLOW and RAMP_DOWN may last a minute each
-# With the worst that is let pass the pump gives its mean flow for a minute, or all it has while it is ramped down
+# With the worst that passes, the pump gives its mean flow for a minute, or its full flow while it is ramped down
 HIGHEST_UM = 5.3 * 60.0 / 2 + 30.0
 
 
@@ -87,7 +87,7 @@ def draw(chance: random.Random) -> Config | None:
 
 @dataclass
 class Story:
-    """What an onlooker saw."""
+    """What an observer saw."""
 
     held: bool = False
     faults_before: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ class Story:
 
 
 def tell(config: Config, event: str) -> Story:
-    """Let it hold, let something happen, and look at the mirror itself."""
+    """Let it hold, let something happen, and check the mirror itself."""
     assert config.devices is not None
     bench = VirtualBench(Plant(config.twin, config.pump), config.devices.watchdog_s)
     run = VirtualRun(config, bench, SENSITIVITY)
@@ -141,7 +141,7 @@ def failures(config: Config, event: str) -> Iterator[str]:
 
 
 def judged(seeds: range, passing: bool = True) -> tuple[int, int, list[str]]:
-    """How many were drawn, and of those let pass (or refused) how many there are and what the onlooker says."""
+    """Numbers of configurations drawn and passed (or refused), and the observer's findings."""
     drawn = looked_at = 0
     found = []
     for seed in seeds:
@@ -166,7 +166,7 @@ def test_what_passes_holds_and_ends_safely() -> None:
 
 
 def test_the_onlooker_is_not_blind() -> None:
-    """Many a refused one only lacks a guard that this story does not need; but not all of them."""
+    """Many refused ones only lack a guard that this story does not need; but not all."""
     _, refused, found = judged(range(16), passing=False)
     assert len({line.split(":")[0] for line in found}) >= refused // 5 >= 1
 

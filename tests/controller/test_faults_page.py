@@ -1,4 +1,4 @@
-"""The pages made from the safety table are as fresh as the table."""
+"""The pages made from the safety table are up to date."""
 
 from __future__ import annotations
 

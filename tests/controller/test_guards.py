@@ -1,4 +1,4 @@
-"""Whatever watches over the program is watched itself: its end is a fault of the running hold, as it is wired."""
+"""Every guard of the program is itself guarded: its end is a fault of the running hold."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class LoopClock:
 
 
 class Instrument:
-    """Fills any role of a bench on which nothing happens."""
+    """Fills any role of an idle bench."""
 
     def __init__(self, value: float = 0.0) -> None:
         self.value, self.samples = value, 0
@@ -198,7 +198,7 @@ def test_children_that_cannot_be_looked_after_are_a_fault(bench: Bench) -> None:
 
 
 def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_was() -> None:
-    """An error that no judgement catches, in the midst of a hold."""
+    """An error that nothing catches, in the middle of a hold."""
     commands: list[BenchCommand] = []
 
     class Recording(RoleBench):
@@ -228,7 +228,7 @@ def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_
 
 
 def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
-    """What a thread raises is seen by nobody: anything is told as what a disk refuses is."""
+    """Nobody sees what a thread raises: any error is reported as a disk error is."""
     told: list[EventLine] = []
     with FaultLatch(LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append) as fault_latch:
         fault_latch._disk.submit(fault_latch._try, raises)

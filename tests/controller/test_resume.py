@@ -1,4 +1,4 @@
-"""The resume rule: only what is listed, only after the whole wait, only so often a day; never what has vented."""
+"""The resume rule: only listed faults, only after the whole wait, only so often a day; never after a vent."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(seen: 
     assert fault.rule.possible
     fault.due(1.0, seen)
     assert (fault.rule.possible, fault.rule.clear_mask) == (False, 0)
-    assert not any(fault.due(2.0 + second) for second in range(60))  # although nothing of it is left to be seen
+    assert not any(fault.due(2.0 + second) for second in range(60))  # although nothing of it is visible any more
     assert not fault.rule.possible
     fault.rule.forget()
     fault.due(100.0)
@@ -110,7 +110,7 @@ def test_the_watchdogs_own_bit_is_all_that_is_cleared() -> None:
 
 def test_the_cause_must_stay_away_for_the_whole_wait() -> None:
     fault = Fault()
-    assert not fault.due(1000.0)  # nobody has seen the cause go: the wait begins now
+    assert not fault.due(1000.0)  # the cause was not seen to go: the wait begins now
     assert not fault.due(1001.0, LOST)
     assert [fault.due(now_s) for now_s in (1002.0, 1011.0)] == [False, False]
     assert not fault.due(1011.5, LOST)

@@ -1,4 +1,4 @@
-"""What a row shows is of its own tick: computed in every state, or absent (NaN), never held."""
+"""A row's values are its own tick's: computed in every state, or absent (NaN), never held."""
 
 from __future__ import annotations
 

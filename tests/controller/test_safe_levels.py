@@ -1,4 +1,4 @@
-"""The safe levels: the times of its rungs, and that a cause which comes and goes gains none."""
+"""The safe levels: their times, and that a cause that comes and goes gains none."""
 
 from __future__ import annotations
 

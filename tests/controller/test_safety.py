@@ -1,4 +1,4 @@
-"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault is there."""
+"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault trips."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_bad_ticks_further_apart_than_the_window_are_nothing(rule: Rule) -> None
 def test_a_state_where_a_rule_does_not_apply_forgets_its_history(rule: Rule) -> None:
     elsewhere = next((s for s in State if s not in rule.states), None)
     if elsewhere is None:
-        assert rule.rung == Rung.VENT  # only what vents is judged in every state
+        assert rule.rung == Rung.VENT  # only venting rules apply in every state
         return
     table = judge_alone(rule)
     for _ in range(rule.window * 2):

@@ -1,4 +1,4 @@
-"""Who is asked in which state, and what is forgotten when."""
+"""Which sensors are compared in which state, and what is reset when."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump that is commanded off: seen to stand, running on, or giving gas that only the mirror shows."""
+"""A pump that is commanded off: seen off, running on, or giving gas that only the mirror shows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STILL = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.0, Fals
 
 
 class Watched:
-    """A pump commanded off, and what is read."""
+    """A pump commanded off, and the readings."""
 
     def __init__(self) -> None:
         self.stand = Standstill(CONFIG.loop, CONFIG.states)
@@ -60,7 +60,7 @@ def test_one_look_at_a_pump_that_stands_begins_the_time_anew() -> None:
 
 
 def test_what_a_lost_link_has_not_carried_is_not_held_against_the_pump() -> None:
-    """A lost answer says nothing, a lost link means that the command has not arrived."""
+    """A lost answer proves nothing; a lost link means that the command has not arrived."""
     on = replace(STILL, pump_fraction=1.0)
     lost, cut = Watched(), Watched()
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""Whatever is read and whatever is asked, in any order: the invariants of the state machine hold (hypothesis)."""
+"""With any readings and any commands in any order, the invariants of the state machine hold (hypothesis)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ warms = st.sampled_from([0, 5, 20, 40])
 
 
 class Driver:
-    """Feeds a controller, and holds what it says against the invariants."""
+    """Feeds a controller, and checks its outputs against the invariants."""
 
     def __init__(self, warm: int = 0) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
@@ -151,7 +151,7 @@ def test_no_order_of_commands_alone_trips_a_healthy_mirror(warm: int, asked: lis
 
 
 def test_what_is_generated_goes_everywhere() -> None:
-    """The properties above would say nothing of states that their examples never reach."""
+    """The properties above would not cover states that their examples never reach."""
     seen: set[State] = set()
 
     @settings(max_examples=120, deadline=None, derandomize=True, database=None)

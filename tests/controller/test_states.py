@@ -1,4 +1,4 @@
-"""What each state waits for before it is left, played on the virtual bench at 10 Hz."""
+"""What each state waits for, on the virtual bench at 10 Hz."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FAR_BELOW: dict[str, Any] = {
 
 
 def changes(outcome: Outcome, state: str) -> list[float]:
-    """When a state was entered, s."""
+    """Times at which a state was entered, s."""
     return [event["mono_s"] for event in outcome.of("state") if event["state"] == state]
 
 
@@ -117,7 +117,7 @@ def test_a_vent_that_does_not_empty_the_bowl_is_told_of() -> None:
 
 
 def test_a_stop_is_the_last_word() -> None:
-    """A `lower` in the same tick makes no standby of the stop."""
+    """A `lower` in the same tick does not turn the stop into standby."""
     outcome = played(
         {"time_s": 19.0, "wrong": "readback_fraction", "value": 0.5, "for_s": 2.5},
         {"time_s": 20.0, "command": "stop"},
@@ -197,7 +197,7 @@ def test_a_pause_ends_where_the_mirror_strays_too_far() -> None:
 
 
 def test_a_stop_of_a_pump_that_runs_on_is_no_success() -> None:
-    """The pump stays at full flow and says so; the vent is opened, and the exit code tells."""
+    """The pump stays at full flow and reports it; the vent opens, and the exit code shows it."""
     outcome = played(
         {"time_s": 20.0, "wrong": "pump_stuck_fraction", "value": 1.0},
         {"time_s": 20.0, "wrong": "readback_fraction", "value": 1.0},
@@ -213,7 +213,7 @@ def test_a_stop_of_a_pump_that_runs_on_is_no_success() -> None:
 @pytest.mark.parametrize("lower_s", [0.0, 20.0])
 @pytest.mark.parametrize("says", [1.0, 0.0])
 def test_a_pump_that_starts_by_itself_is_a_fault_in_standby(lower_s: float, says: float) -> None:
-    """Whether its read-back says so, or only the mirror does, which rises."""
+    """Whether its read-back shows it, or only the rising mirror."""
     outcome = played(
         {"time_s": lower_s, "command": "lower"},
         {"time_s": 60.0, "wrong": "pump_stuck_fraction", "value": 1.0},
@@ -242,7 +242,7 @@ def test_a_pump_that_runs_on_in_a_fault_opens_the_vent() -> None:
 
 
 def test_a_stop_waits_for_a_mirror_that_still_rises_and_ends_as_a_fault() -> None:
-    """Read-back 0, and gas comes in all the same."""
+    """Read-back 0, but gas comes in."""
     outcome = played(
         {"time_s": 20.0, "wrong": "pump_stuck_fraction", "value": 1.0},
         {"time_s": 20.0, "wrong": "readback_fraction", "value": 0.0},
@@ -286,7 +286,7 @@ def test_a_stop_of_a_bench_that_is_gone_is_no_success() -> None:
 
 
 def test_a_latch_between_a_resume_and_its_hold_is_for_good() -> None:
-    """In that one tick of standby the hold is wanted already; an `ack` later on lets nobody's wish through."""
+    """In that one tick of standby the hold is already requested; a later `ack` revives no request."""
     lost = {"time_s": 20.0, "wrong": "unreachable", "for_s": 1.0}
     resume = {"faults": ["link_lost"], "wait_s": 5.0}
     (standby_s,) = changes(played(lost, duration_s=40.0, resume=resume), "standby")

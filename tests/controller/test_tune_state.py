@@ -37,7 +37,7 @@ def tune(**changed: Any) -> Command:
 
 
 class Held:
-    """A twin in hold since a while."""
+    """A twin that has held for a while."""
 
     def __init__(self, config: Config = CONFIG, twin_events: tuple[BenchEvent, ...] = ()) -> None:
         self.bench = VirtualBench(Plant(config.twin, config.pump, twin_events))
@@ -125,7 +125,7 @@ def test_a_lost_laser_ends_it_at_the_holding_flow() -> None:
     held.go(3.0)
     assert held.state == State.HOLD
     assert not held.of("experiment")[-1]["completed"]
-    assert held.rows[-1].flow_um_per_s == pytest.approx(1.24, abs=0.3)  # less the weather
+    assert held.rows[-1].flow_um_per_s == pytest.approx(1.24, abs=0.3)  # minus the weather
     held.bench.wrong.no_light = False
     held.go(30.0)
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
@@ -196,7 +196,7 @@ def gains(kp_per_s: float, trial_s: float = float("nan")) -> Command:
 
 
 def kp_of(held: Held) -> float:
-    """P over the error that it answers: the gain that the loop really has."""
+    """P over its error: the loop's actual gain."""
     rows = [row for row in held.rows[-200:] if abs(row.error_um) > 0.02]
     return float(np.median([row.p_um_per_s / row.error_um for row in rows]))
 

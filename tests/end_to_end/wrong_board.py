@@ -10,7 +10,7 @@ from firmware_iface.emulators.pump_board import PumpBoardEmulator
 
 
 class Still:
-    """A plant on which nothing happens."""
+    """An idle plant."""
 
     def sample(self) -> BoardSample:
         return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, math.nan, 1, 0.0)

@@ -22,7 +22,7 @@ WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog
 
 
 class Still:
-    """A plant on which nothing happens."""
+    """An idle plant."""
 
     def sample(self) -> BoardSample:
         return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, 21.0, 1, 0.0)
