@@ -20,7 +20,7 @@ test: $(STAMP)  ## everything CI runs
 	$(MAKE) --jobs 2 --output-sync lint kernels
 	$(MAKE) --jobs 3 --output-sync real_time rest
 
-rest: $(STAMP)  # the tests in real time wait half of the time, and come first: this takes what they leave
+rest: $(STAMP)  # beside the real-time tests, which wait half of the time: uses the CPU time that they leave
 	nice -n 19 $(MAKE) types fast
 
 lint: $(STAMP)
@@ -36,12 +36,12 @@ docs: $(STAMP)  ## the documentation as a site, on http://127.0.0.1:8000
 types: $(STAMP)
 	$(BIN)/mypy
 
-kernels: $(STAMP)  # compiled before tests that run in real time would wait for it
+kernels: $(STAMP)  # compiled first, so that real-time tests do not wait for it
 	rm -rf build/kernels
 	$(BIN)/membrane-ctrl simulate build/kernels --shrink 12
 	$(BIN)/membrane-ctrl measure build/kernels --no-pictures
 
-# of each worker: more would only wait for each other
+# per worker: more threads would only wait for each other
 fast: export OPENBLAS_NUM_THREADS = 1
 fast: $(STAMP)
 	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
@@ -51,21 +51,21 @@ real_time: $(STAMP)
 
 unit: fast real_time
 
-shake: $(STAMP)  ## the same tests on a machine that stands still for a second, again and again; SEED=2 for other moments
+shake: $(STAMP)  ## the same tests on a machine that pauses for a second, again and again; SEED=2 for other moments
 	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks
 
-campaign: $(STAMP)  ## everything that may go wrong, in virtual time and with real processes; docs/fault-matrix.md, sensor-faults.md
+campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs/fault-matrix.md, sensor-faults.md
 	$(BIN)/pytest -m campaign
 	rm -f build/sensor-faults.jsonl
 	$(BIN)/python tests/campaign/sensor_faults_page.py
 
-mutants: $(STAMP)  ## wrong code on purpose: what the fast tests notice, and what the campaign alone; under an hour
+mutants: $(STAMP)  ## code made wrong on purpose: what the fast tests notice, and what the campaign alone; under an hour
 	$(BIN)/python tests/mutants/mutants.py
 
-fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (an hour)
+fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (20 minutes)
 	$(BIN)/python tests/fuzz/fuzz_folders.py
 
 generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table

@@ -53,7 +53,7 @@ class LaserAtRest:
 
 
 class PanelScene:
-    """What the camera sees of the panel; made before, as a camera has no Python to wait for."""
+    """The panel as the camera sees it; rendered beforehand, as a real camera runs no Python."""
 
     def __init__(self, panel: EmulatedPanel[Shown]) -> None:
         self._panel = panel

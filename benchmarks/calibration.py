@@ -1,8 +1,8 @@
 """The mirror calibrates its optics: accuracy over seeds, truth of the covariance, bow.
 
 Accuracy: five sets a seed, rendered and decoded as `calibrate` does, at a quarter of the camera's resolution with the
-noise of the sixteen pixels that each large one stands for (16-bit frames). The true bench is off by what is known of
-each parameter: the paper's 2 mm, 2 mm and 0.3 degrees, 0.5 degrees of screen tilt, and the other eight likewise.
+noise of the sixteen pixels that each large one stands for (16-bit frames). The true bench is drawn from the
+parameters' sigmas: the paper's 2 mm, 2 mm and 0.3 degrees, 0.5 degrees of screen tilt, and the other eight likewise.
 Covariance: a hundred seeds of traced points with the information of all pixels.
 """
 
@@ -100,7 +100,7 @@ def _problem(sets: tuple[SetPhases, ...], free: dict[str, float] | None = None) 
 
 
 def _plain(problem: Problem) -> Problem:
-    """a, b and alpha alone, no ring and no laser's scale; what they cannot explain counts as noise."""
+    """a, b and alpha alone, without ring and laser scale; the rest counts as noise."""
     held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
     sets = []
     for phases, state in zip(problem.sets, first_states(problem), strict=True):
@@ -208,7 +208,7 @@ def _traced(values: FloatArray, seed: int) -> tuple[SetPhases, ...]:
     sigma_mm = 49.82 / (2 * np.pi) * math.sqrt(2 / 4) * _PIXEL_NOISE_ADU / 80 * math.sqrt(POINTS / _PIXELS)
     sets = []
     for k, moved_um in enumerate(MOVED_UM):
-        count = int(POINTS / 0.43)  # this share of the picture sees the mirror
+        count = int(POINTS / 0.43)  # share of the picture that sees the mirror
         column, row = rng.uniform(0, width - 1, count), rng.uniform(0, height - 1, count)
         rays = geometry.rays(column, row).T
         met = trace(camera, rays, film.terms, film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)

@@ -1,6 +1,6 @@
-"""How long a calibration takes from files to the geometry, by the clock and of the processors.
+"""How long a calibration takes from files to the geometry, in clock and CPU time.
 
-The clock is what a person waits for; on a busy machine the processors' seconds are what can be compared.
+A person waits for the clock time; on a busy machine only the CPU time can be compared.
 """
 
 from __future__ import annotations

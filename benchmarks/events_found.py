@@ -22,7 +22,7 @@ REACH_S = {DOOR: 4.0, LEAK: 240.0, GLITCH: 2.0, LOST: 7.0, LATE: 12.0, JUMP: 30.
 
 
 def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted], list[FoundEvent]]:
-    """What was put into a night and what was found in it."""
+    """Events planted in a night, and events found in it."""
     rng = np.random.default_rng(1000 + seed)
     events = planted(rng, hours)
     rows, estimates = night(seed, hours, scenario, events)
@@ -39,7 +39,7 @@ def matched(events: list[Planted], found: list[FoundEvent]) -> tuple[list[Plante
         near = [f for f in left if f.kind == event.kind and abs(f.time_s - event.time_s) <= REACH_S[event.kind]]
         missed += [] if near else [event]
         left = [f for f in left if f not in near]
-    # what an event also does is no false alarm: a leak step raises the noise, a lost laser ends in a spike
+    # side effects of an event are no false alarm: a leak step raises the noise, a lost laser ends in a spike
     return missed, [f for f in left if not any(abs(f.time_s - e.time_s) < 900 and _echo(f, e) for e in events)]
 
 

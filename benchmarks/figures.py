@@ -1,4 +1,4 @@
-"""What a benchmark says: a figure, what it is compared with in the same run, and the target it has."""
+"""The result of a benchmark: a figure, its reference from the same run, and its target."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Figure:
     name, unit : str
     value : float
     reference : str
-        What it is compared with.
+        Name of the reference.
     reference_value : float or None
         Measured or computed in the same run, same unit.
     target : str
@@ -66,7 +66,7 @@ def at_least(
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
+    """The machine of the figures."""
     model = next(
         (
             line.split(":", 1)[1].strip()

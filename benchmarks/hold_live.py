@@ -45,7 +45,7 @@ def hold_twin(duration_s: float, config: str = "") -> dict[str, Any]:
 
 def run() -> list[Figure]:
     """Figures of one run with everything on."""
-    hold_twin(8)  # what is not compiled yet is compiled before anything is measured
+    hold_twin(8)  # compiles the kernels before anything is measured
     bare_p99_ms = float(np.percentile(asyncio.run(_bare_loop(10.0)), 99))
     s = hold_twin(DURATION_S)
     late, latency = s["lateness_ms"], s["cycle_latency_ms"]

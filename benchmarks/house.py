@@ -49,7 +49,7 @@ class Module:
 
 @dataclass(frozen=True)
 class HouseFigures:
-    """What is measured and limited; the names are those of `LIMITS`."""
+    """The limited figures; the names are those of `LIMITS`."""
 
     modules: int
     lines: int
@@ -60,9 +60,9 @@ class HouseFigures:
     largest_circle: int
 
 
-# A newcomer finds the room in a minute; a change that needs more has to argue here.
-# Lines: the house stood at 49,860 of at most 50,000 when its rooms were in order; capabilities added since have 3,000
-# more. What outgrows that makes something superfluous first.
+# A newcomer finds the room in a minute; a change that needs more must give its reason here. Lines: the code had
+# 49,860 lines when its rooms were in order; capabilities added since may take 3,000 more. Beyond that, remove
+# something superfluous first.
 LIMITS = HouseFigures(280, 53_000, 5.0, 3, 16, 9, 1)
 
 

@@ -1,4 +1,4 @@
-"""The inner loop on the simulated bench, in virtual time: what the centre truly does.
+"""The inner loop on the simulated bench, in virtual time: the true motion of the centre.
 
 `run()` gives the figures, `python -m benchmarks.inner_loop` prints them as the tables of docs/control.md.
 """
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class HeldRun:
-    """A run, one row a tick: `true_um` is where the centre really is, `leak_um_per_s` the estimate."""
+    """A run, one row a tick: `true_um` is the true centre, `leak_um_per_s` the estimate."""
 
     time_s: Array
     true_um: Array
@@ -52,7 +52,7 @@ def hold(
     target_um: Callable[[float], float] = lambda time_s: 0.0,
     true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
 ) -> HeldRun:
-    """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` one the loop does not know of."""
+    """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` a pump unknown to the loop."""
     plant, controller = Plant(twin, true_pump, events), InnerLoop(loop, PumpConfig())
     dt_s = 1 / loop.rate_hz
     controller.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
@@ -103,7 +103,7 @@ def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float,
 
 
 def answer(sensors: str, event: BenchEvent, seeds: Sequence[int], near_um: float) -> dict[str, float]:
-    """Peak of the true centre after an event at 60 s, and the time until it is near for good."""
+    """Peak of the true centre after an event at 60 s, and the time until it stays near."""
     peaks_um, back_s = [], []
     for seed in seeds:
         held = hold(*_configs(sensors, "quiet", seed), 120.0, [event])

@@ -1,6 +1,6 @@
 """The laser's mount drifts 2 um/min for ten minutes: with the shape loop on rendered full-size frames, and without.
 
-Virtual time: the same controller, the same camera frames, the same reconstruction; only nobody waits.
+Virtual time: the same controller, the same camera frames, the same reconstruction, without waiting.
 """
 
 from __future__ import annotations

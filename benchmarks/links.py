@@ -1,4 +1,4 @@
-"""Serial links under random faults: how many wrong values are believed (none), and how far off the worst one is.
+"""Serial links under random faults: how many wrong values are accepted (none), and how far off the worst one is.
 
 Link, driver and emulated instrument are the real ones, the wire between them is memory and time is virtual: late
 answers and timeouts cost nothing, and every run is the same. A tenth of all questions or answers is hit. Only Modbus
@@ -53,7 +53,7 @@ HIT = 0.05  # of all questions, and of all answers
 
 @dataclass(slots=True)
 class Audit:
-    """What became of the transactions of one link. `worst` is the largest error of a value that was believed."""
+    """Results of the transactions of one link. `worst` is the largest error of an accepted value."""
 
     believed: int = 0
     refused: int = 0
@@ -67,14 +67,14 @@ class Audit:
         return self.believed + self.refused + self.cancelled
 
     def judge(self, error: float, tolerance: float) -> None:
-        """One value that was believed."""
+        """Count one accepted value."""
         self.believed += 1
         self.worst = max(self.worst, error)
         self.wrong += not error <= tolerance  # NaN is wrong
 
 
 def random_faults(seed: int) -> Callable[[], SerialFaults]:
-    """One fault at a time: late by up to four timeouts, lost, cut, garbage, one to three turned bits."""
+    """One fault at a time: late by up to four timeouts, lost, cut, garbage, one to three flipped bits."""
     dice = random.Random(seed)
 
     def draw() -> SerialFaults:
@@ -155,8 +155,8 @@ async def _numbers(
 ) -> None:
     """Numbers that never come twice are written and read back, to three places of each device.
 
-    A confirmed write has to be in the device. What is read has to be the number that was confirmed last at this
-    place, or one that was tried since.
+    A confirmed write must be in the device. A read must give the number last confirmed at this place, or one tried
+    since.
     """
     possible = {(unit, address): {0} for unit in tables for address in (0, 4, 8)}
     number = 0
@@ -187,7 +187,7 @@ async def _numbers(
 
 
 async def _perhaps_cancelled(call: Coroutine[Any, Any, Any], dice: random.Random) -> Any:
-    """The result of a call that is sometimes cancelled in mid-air. Raises CancelledError then."""
+    """The result of a call that is sometimes cancelled in flight. Raises CancelledError then."""
     task = asyncio.ensure_future(call)
     if dice.random() < CANCELLED:
         await asyncio.wait([task], timeout=dice.uniform(0.0, TCP_TIMEOUT_S))
@@ -269,7 +269,7 @@ async def _pump(
     audit: Audit,
     seed: int,
 ) -> None:
-    """A command that was confirmed has to be what drives the gas (`driven[0]`, 0..1)."""
+    """A confirmed command must drive the gas (`driven[0]`, 0..1)."""
     dice = random.Random(seed)
     await driver.open()
     emulator.draw_faults = random_faults(seed)
@@ -293,7 +293,7 @@ async def _pump(
 
 
 async def _ptb330(transactions: int, audit: Audit, seed: int) -> None:
-    """Pressure that runs up and down; the message and its age together may be off by what it ran in three seconds."""
+    """Pressure that rises and falls; message and age together may be off by its change in three seconds."""
 
     def pressure_pa() -> float:
         return 101_325.0 + 0.1 * abs(asyncio.get_running_loop().time() % 4000.0 - 2000.0)
@@ -341,7 +341,7 @@ REAL_TIME = ("Modbus TCP",)
 
 
 def audit(name: str, transactions: int, seed: int = 1) -> Audit:
-    """So many transactions of one link under random faults."""
+    """Run `transactions` on one link under random faults."""
     result = Audit()
     main = LINKS[name][0](transactions, result, seed)
     asyncio.run(main) if name in REAL_TIME else run_virtual(main)

@@ -58,7 +58,7 @@ class SharedClock(RunClock):
     memory: str = ""
 
     def now(self) -> float:
-        """What the feeder has put there."""
+        """The feeder's time."""
         memory = _attached(self.memory)
         assert memory.buf is not None
         return float(_DOUBLE.unpack_from(memory.buf, 0)[0])
@@ -74,19 +74,19 @@ def _attached(name: str) -> SharedMemory:
 
 
 def hurried_recorder(spec: RecorderSpec, status: Connection) -> None:
-    """The recorder without its rest between two looks at the rings."""
+    """The recorder without its pause between two reads of the rings."""
     process.POLL_S = 1e-3
     process.recorder_main(spec, status)
 
 
 def quiet_console(spec: ConsoleSpec) -> None:
-    """The console without a terminal, and without anybody who reads it."""
+    """The console without a terminal or reader."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     console_main(spec)
 
 
 def mute_alarms(spec: AlarmsSpec) -> None:
-    """The alarms with nobody to tell."""
+    """The alarms without a target."""
     watch(spec, [lambda notice: True], lambda event: None, lambda: True)
 
 
@@ -149,7 +149,7 @@ def _children(
 
 
 def _rounds(config: Config) -> Iterator[tuple[float, RunPart]]:
-    """A week: the way to the hold once, and then the same 20 minutes of it, each time later."""
+    """A week: the approach to the hold once, then the same 20 minutes of it, each time later."""
     seconds = list(parts_of(config, 2 * ROUND_S, 1.0))
     count = round(ROUND_S)
     first, again = seconds[:count], seconds[count:]
@@ -200,13 +200,13 @@ def _tick_later(message: bytes, ticks: int, by_s: float) -> bytes:
 
 
 def _wait_for_writes(status: Connection, count: int) -> None:
-    """The recorder says that it is alive after each write."""
+    """Wait for the recorder's report `alive`, which follows each write."""
     while count:
         count -= status.recv()["kind"] == "alive"
 
 
 def _thin_out(run_dir: Path) -> None:
-    """A week is some GB: what is closed and optimised is not needed here."""
+    """A week is some GB: remove closed, optimised segments."""
     for path in sorted(run_dir.glob("*.rrd"))[:-30]:
         path.unlink()
 

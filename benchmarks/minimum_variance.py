@@ -1,9 +1,9 @@
 """The least standard deviation of the true centre that any linear controller could reach.
 
-The pump's dead time theta is what nobody can get around: whatever is decided now acts at t + theta, so the centre's
-error is at least the error of the best prediction of the disturbance over theta from the readings until now (Astrom,
-Introduction to Stochastic Control Theory, 1970, chapter 6). The best prediction is the Kalman filter's. The pump's
-lag is no limit of its own: it can be inverted.
+No controller can avoid the pump's dead time theta: a decision now acts at t + theta, so the centre's error is at
+least the error of the best prediction of the disturbance over theta from the readings until now (Astrom, Introduction
+to Stochastic Control Theory, 1970, chapter 6). The best prediction is the Kalman filter's. The pump's lag is no limit
+of its own: it can be inverted.
 """
 
 from __future__ import annotations
@@ -48,6 +48,6 @@ def least_std_um(loop: LoopConfig, twin: TwinConfig) -> float:
     transition, kicks = _discrete(drift, diffusion, 1 / loop.rate_hz)
     before = solve_discrete_are(transition.T, c.T, kicks, r)
     after = before - before @ c.T @ np.linalg.solve(c @ before @ c.T + r, c @ before)
-    dead_s = TRANSPORT_S + WRITE_S + 0.5 / loop.rate_hz  # the command stands for a tick
+    dead_s = TRANSPORT_S + WRITE_S + 0.5 / loop.rate_hz  # the command holds for a tick
     transition, kicks = _discrete(drift, diffusion, dead_s)
     return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))

@@ -1,4 +1,4 @@
-"""Uncertainty and stability at full size: the paper's figures, and what all its sets cost."""
+"""Uncertainty and stability at full size: the paper's figures, and the cost of all its sets."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _papers(benches: list[TrialBench], trials: np.ndarray, linear: np.ndarray, s
 
 
 def _one_pixel_um(sag_mm: float, swing_adu: float) -> float:
-    """Mean RMSE of a pair if both phases are counted from what one pixel at O' shows.
+    """Mean RMSE of a pair if both phases are counted from one pixel at O'.
 
     Its noise then shifts the whole phase map: a tilt of the mirror about its vertex, sigma r at radius r, with r on
     average 2/3 of the radius; sqrt(2) for two sets.

@@ -130,7 +130,7 @@ def night(
 
 
 def batch_of(rows: Rows) -> TickBatch:
-    """Ticks with these rows, and what they were given as far as the rows say it."""
+    """Ticks with these rows, and their inputs as far as the rows give them."""
     records = np.zeros(len(rows), dtype=RECORD)
     for name, column in GIVEN.items():
         if (field := column.removeprefix("given_")) in COLUMN:

@@ -24,7 +24,7 @@ Rings = dict[str, RingWriter]
 
 @dataclass(slots=True)
 class RunPart:
-    """What goes into the rings in some time of a run."""
+    """The messages of some time of a run."""
 
     telemetry: list[bytes] = field(default_factory=list)
     inputs: list[bytes] = field(default_factory=list)
@@ -32,7 +32,7 @@ class RunPart:
     events: list[bytes] = field(default_factory=list)
 
     def put(self, rings: Rings) -> None:
-        """Into the rings of these names."""
+        """Put them into the rings of these names."""
         for name, ring in rings.items():
             for message in getattr(self, name):
                 ring.put(message)

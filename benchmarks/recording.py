@@ -1,4 +1,4 @@
-"""Bytes of a day: an hour of hold at 50 Hz with a shape each 2 s through the real recorder, a write each 0.8 s.
+"""Bytes of a day: an hour of hold at 50 Hz with a shape every 2 s through the real recorder, a write every 0.8 s.
 
 python -m benchmarks recording
 """
@@ -38,7 +38,7 @@ class HandClock(RunClock):
     moment_s = 0.0
 
     def now(self) -> float:
-        """Where the hand has put it."""
+        """The time set by hand."""
         return HandClock.moment_s
 
 
@@ -82,7 +82,7 @@ def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
 
 
 def _optimised_s(run_dir: Path) -> float:
-    """How long the segments take: at the end of a run no more than 20 s of it are waited for."""
+    """Time to optimise the segments: at the end of a run the recorder waits at most 20 s for it."""
     begun_s = time.perf_counter()
     optimizer = Optimizer(run_dir)
     for path in sorted(run_dir.glob("*.rrd")):

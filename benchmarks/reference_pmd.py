@@ -1,4 +1,4 @@
-"""The paper's method as one would write it down in NumPy: the reference for speed, and a second opinion on accuracy.
+"""The paper's method, written plainly in NumPy: the reference for speed, and a second opinion on accuracy.
 
 Every pixel, four-step arctangent, 2N x 36 design matrix rebuilt at each of five iterations, normal equations solved
 as a whole. Two things cannot be taken as printed: the matrix with piston is singular, so piston is left out here

@@ -24,7 +24,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
 
 MONTH_DAYS = 30.0
-# Written part by part: a part is this long, and all there is of it in memory.
+# Written part by part: a part is this long, and only one is in memory.
 _PART_HOURS = 6.0
 _CHILD = """
 import json, resource, sys, time

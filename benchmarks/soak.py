@@ -31,7 +31,7 @@ from tests.support.bench_events import BenchEvent, DailyTemperature, LaserDropou
 DAY_S = 86_400.0
 RATE_HZ = 10.0
 BAND_UM, MINUTE_BAND_UM = 2.0, 0.5
-# something a day of each kind: a glitch of the laser, an answer lost, a network that restarts, a board that does
+# kinds of fault: a laser glitch, a lost answer, a network that restarts, a board that restarts
 _RESUMES = ("link_lost", "device_silent", "watchdog_tripped", "board_fault")
 _FAULTS = (("no_light", 3.0), ("silent", 0.2), ("unreachable", 20.0), ("power", 0.0))
 LASER_LOST_S, LASER_BACK_S = 120.0, 130.0
@@ -74,7 +74,7 @@ class Means:
 
 @dataclass
 class SoakTally:
-    """What is kept of a soak."""
+    """The statistics of a soak."""
 
     second: Means = field(default_factory=lambda: Means(round(RATE_HZ), BAND_UM))
     minute: Means = field(default_factory=lambda: Means(round(60 * RATE_HZ), MINUTE_BAND_UM))
@@ -90,7 +90,7 @@ class SoakTally:
 
 
 def soak_config(seed: int) -> Config:
-    """The defaults at 10 Hz; what the faults here do may resume by itself."""
+    """The defaults at 10 Hz; the faults of the soak may resume automatically."""
     return Config(
         loop=LoopConfig(rate_hz=RATE_HZ),
         twin=TwinConfig(seed=seed),
@@ -102,7 +102,7 @@ def soak_config(seed: int) -> Config:
 def soak(
     days: float, seed: int, faults: bool = True, events: tuple[BenchEvent, ...] = (), take: Take | None = None
 ) -> SoakTally:
-    """Hold for `days` or until ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
+    """Hold for `days` or until Ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
     config = soak_config(seed)
     bench = VirtualBench(Plant(config.twin, config.pump, events))
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
@@ -149,7 +149,7 @@ def _count(tick: VirtualTick, tally: SoakTally) -> None:
 
 
 def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
-    """When which fault sets in, and for how long."""
+    """Which fault begins when, and for how long."""
     rng = np.random.default_rng(seed)
     at_s = 3600.0
     while True:
@@ -172,7 +172,7 @@ def rss_mb() -> float:
 
 
 def dropout_excursions_um(seeds: range = range(12)) -> list[float]:
-    """Way of the true centre from its place in 10 s without a laser, a figure a seed of typical weather."""
+    """Excursion of the true centre in 10 s without a laser, one figure a seed of typical weather."""
     return [_dropout_excursion_um(seed) for seed in seeds]
 
 
@@ -192,7 +192,7 @@ def _dropout_excursion_um(seed: int) -> float:
 def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure]:
     """A soak of `days` with everything, as figures."""
     tally = soak(days, seed, True, everything(seed), take)
-    days = tally.days  # fewer, if somebody has stopped it
+    days = tally.days  # fewer if stopped
     grown = 100 * (tally.rss_mb / tally.rss_after_hour_mb - 1)
     return [
         at_most("simulated days, with weather and faults", days, "d"),
@@ -227,7 +227,7 @@ def run() -> list[Figure]:
 
 
 def _tell_days(tick: VirtualTick) -> None:
-    """A line a simulated day, for who waits."""
+    """Print a line per simulated day."""
     day, second = divmod(tick.row.mono_s, DAY_S)
     if second < tick.row.dt_s / 2:
         print(f"day {day:.0f}: {tick.row.state.name.lower()}, {rss_mb():.1f} MB", file=sys.stderr, flush=True)

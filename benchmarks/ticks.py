@@ -1,7 +1,7 @@
 """Reading and commanding the pump board tick by tick: how late ticks begin, and how long one takes.
 
 The reference for lateness is a bare asyncio loop of the same rate, measured just before. Modbus RTU is paced as a
-line of 115200 baud. Board, line and driver share one process: the figures hold their cost, too.
+line of 115200 baud. Board, line and driver share one process, so the figures include their cost.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tuning on the simulated bench, in virtual time, seed by seed: what is identified, proposed and then achieved.
+"""Tuning on the simulated bench, in virtual time, seed by seed: identified, proposed and achieved figures.
 
 `run()` gives the figures, `python -m benchmarks.tuning` prints them as the tables of docs/tuning.md.
 """
@@ -28,13 +28,13 @@ from tuning.rig import Rig
 SETTLE_S = 40.0
 OBSERVE_S = 600.0
 VERIFY_S = 600.0
-# the vent that lets out as much as the leak, 1.24 um/s at 100 um/s fully open
+# the vent opening that equals the leak, 1.24 um/s at 100 um/s fully open
 BLEED_FRACTION = 0.0124
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A bench: weather, laser, sensors, and what differs from the nominal plant, as factors."""
+    """A bench: weather, laser, sensors, and factors on the nominal plant."""
 
     scenario: str = "typical"
     laser_noise_um: float = 1.0
@@ -46,7 +46,7 @@ class Case:
 
     @property
     def holding_flow_um_per_s(self) -> float:
-        """What the commanded flow will settle at."""
+        """The commanded flow in steady state."""
         return 1.24 * (self.leak + self.bleed) / self.pump
 
     def loop(self) -> LoopConfig:
@@ -122,7 +122,7 @@ def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, 
 
 
 def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
-    """A whole session on one twin, then the true centre in fresh weather; with `rules` also the textbook's gains."""
+    """A whole session on one twin, then the true centre in fresh weather; with `rules` also textbook gains."""
     bench, before = TwinBench(case, seed), case.loop()
     rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
     done = characterise(rig)
@@ -159,7 +159,7 @@ def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
 
 
 def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float) -> dict[str, float]:
-    """True centre under a loop in weather that no session has seen."""
+    """True centre under a loop in weather that no session saw."""
     bench = TwinBench(case, 1000 + seed)
     Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + VERIFY_S)
     true_um = np.array(bench.true_um)[round(SETTLE_S * loop.rate_hz) :]

@@ -1,4 +1,4 @@
-"""How much faster than real time a hold runs in virtual time, board and all, and what the time goes into."""
+"""How much faster than real time a hold runs in virtual time, board included, and where the time goes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _times_real(shape: bool) -> float:
 
 
 def _shares() -> dict[str, float]:
-    """Share of each part in the own time of its functions; what is called built in goes to its caller's side."""
+    """Share of each part in the own time of its functions; built-ins count with their caller."""
     profile = cProfile.Profile()
     profile.runcall(_hold, False)
     totals: dict[str, float] = defaultdict(float)

@@ -1,4 +1,4 @@
-"""`ctl` against a running `hold --twin`, as an operator uses it."""
+"""`ctl` with a running `hold --twin`, as an operator uses it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Asked:
-    """What `ctl` said; run in the test's own process, as a start of Python takes longer than all it does."""
+    """Output of `ctl`; run in the test's own process, as Python's start takes longer than the command."""
 
     code: int
     out: str

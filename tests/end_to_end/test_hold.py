@@ -128,7 +128,7 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     assert captured["verdict"] == "ok"
     head = read_head(run_dir(tmp_path) / str(captured["set"]))
     assert (head.kind, len(head.patterns)) == ("full", 18)
-    assert np.isfinite(head.displacement_um).mean() > 0.5  # none for a frame beside which the machine stood still
+    assert np.isfinite(head.displacement_um).mean() > 0.5  # none for a frame during which the machine was paused
     assert abs(np.nanmean(head.displacement_um)) < 5.0
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
     assert summary["exit"] == "done"
@@ -151,7 +151,7 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
 def test_a_signal_to_the_whole_group_stops_cleanly_with_130(
     tmp_path: Path, running: subprocess.Popen[str], number: signal.Signals
 ) -> None:
-    """Ctrl-C and `timeout` reach the children first; the bench and the recorder have to outlive it."""
+    """Ctrl-C and `timeout` reach the children first; the bench and the recorder must survive it."""
     wait_for(lambda: reached(tmp_path, "inflate"))
     for process in psutil.Process(running.pid).children(recursive=True):
         process.send_signal(number)
@@ -185,7 +185,7 @@ def test_another_client_reads_along_and_sigkill_stops_the_pump_and_loses_nothing
 
 
 def run_refused(arguments: list[str], exit_code: int) -> str:
-    """In the test's own process: a start of Python takes longer than a refusal."""
+    """In the test's own process: Python's start takes longer than a refusal."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = run(arguments)
@@ -285,7 +285,7 @@ def test_the_served_twin_can_be_held_by_another_process(tmp_path: Path) -> None:
 
 
 def test_a_board_with_another_map_version_is_refused(tmp_path: Path) -> None:
-    """A board that is not ours to drive is found out before a run folder exists."""
+    """A board that we cannot drive is detected before a run folder exists."""
     server = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("wrong_board.py"))], stdout=subprocess.PIPE, text=True
     )
@@ -308,7 +308,7 @@ def nobodys_shared_memory() -> set[Path]:
     for process in psutil.process_iter():
         try:
             found -= {Path(mapped.path) for mapped in process.memory_maps()}
-        except psutil.Error:  # it has just ended, or is not ours to look at
+        except psutil.Error:  # it has just ended, or we may not inspect it
             continue
     return found
 

@@ -19,7 +19,7 @@ def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
     near = tmp_path / "near.toml"
     patient = {
         "[devices.displacement]\n": "[devices]\nwatchdog_s = 2.0\n[devices.displacement]\ntimeout_s = 1.9\n",
-        "unit_id = 3\n": "unit_id = 3\ntimeout_s = 0.9\n",  # what the two on one line wait for is added up
+        "unit_id = 3\n": "unit_id = 3\ntimeout_s = 0.9\n",  # the waits of the two on one line add up
         "unit_id = 5\n": "unit_id = 5\ntimeout_s = 0.9\n",
         "metrics_port = 9464": "",  # another hold of this machine may have it
     }

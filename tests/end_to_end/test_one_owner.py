@@ -1,4 +1,4 @@
-"""Two programs and one bench on one machine, as their users start them: nothing of a hold is changed beside it."""
+"""Two programs and one bench on one machine, as their users start them: the second changes nothing of a hold."""
 
 from __future__ import annotations
 

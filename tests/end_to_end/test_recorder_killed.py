@@ -1,4 +1,4 @@
-"""A hold whose recorder is killed: the hold goes on, another recorder goes on, and the night can be replayed."""
+"""A hold whose recorder is killed: the hold continues, another recorder takes over, and the night can be replayed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def recorder_of(hold: subprocess.Popen[bytes], run_dir: Path) -> psutil.Process:
             try:
                 if any(Path(file.path).name.startswith("ticks-") for file in child.open_files()):
                     return child
-            except psutil.Error:  # it has just ended, or is one of those that may not be looked into
+            except psutil.Error:  # it has just ended, or we may not inspect it
                 continue
         time.sleep(0.1)
     raise AssertionError("no recorder found")

@@ -1,4 +1,4 @@
-"""A session beside a hold that runs on its own: commands by the port, ticks by the rings, the hold outlives both."""
+"""A session beside an independent hold: commands through the port, ticks from the rings; the hold outlives both."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def connected(logs: Path) -> LiveHold:
 
 def steps(rig: HoldRig, duration_s: float) -> ExperimentSpec:
     around = rig.around(rig.hold(2.0), 10.0)
-    flow = min(max(around.holding_flow_um_per_s, 0.8), 1.8)  # two seconds do not tell it well
+    flow = min(max(around.holding_flow_um_per_s, 0.8), 1.8)  # two seconds give it only roughly
     return ExperimentSpec(kind="steps", duration_s=duration_s, holding_flow_um_per_s=flow, laser_um=around.laser_um)
 
 
@@ -78,7 +78,7 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     assert finished.completed, finished.reason
     assert event.experiment == "steps"
     assert 12.0 <= record.duration_s < 24.0
-    assert record.lost_fraction < 0.3  # a machine that stands still twice skips ticks; they are counted, not hidden
+    assert record.lost_fraction < 0.3  # a machine that pauses twice skips ticks; they are counted, not hidden
     rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0)
     rig.keep()
     link.close()

@@ -1,4 +1,4 @@
-"""A service as systemd starts it: told of every start, kept down by a latched fault, patient in standby."""
+"""A service as systemd starts it: reports every start, stays down with a latched fault, waits in standby."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ KEY = 0x1234_5678
 
 
 class Bench:
-    """A board with a hand on its clock, and somebody who claims it where it knows claims."""
+    """A board with a manual clock, claimed where it supports claims."""
 
     def __init__(self, version: int, key: int = KEY) -> None:
         self.map = known_maps()[version]
@@ -59,7 +59,7 @@ def bench(request: pytest.FixtureRequest) -> Bench:
 
 @pytest.fixture
 def old() -> Bench:
-    """A board that obeys whoever writes."""
+    """A board that obeys every program."""
     return Bench(1)
 
 
@@ -205,13 +205,13 @@ def test_disarming_is_refused_while_the_pump_is_commanded(bench: Bench) -> None:
     ("address", "words", "code"),
     [
         (56, [50_001, 0, 1], 3),  # pump above 1
-        (56, [0, 50_001, 1], 3),  # the vent's fault keeps the pump's word out as well
+        (56, [0, 50_001, 1], 3),  # a wrong vent value keeps the pump's out as well
         (48, [49], 3),  # period too short
         (48, [10_001], 3),
         (49, [2], 3),
         (16, [0, 0], 2),  # read-only
         (59, [0], 2),  # unknown
-        (58, [1, 1], 2),  # runs out of the block
+        (58, [1, 1], 2),  # exceeds the block
         (55, [0, 0], 2),
         (0, [1], 2),
     ],
@@ -338,7 +338,7 @@ def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(cl
     sensors = claimed.get("sensors")
     assert (sensors["claim_in_force"], sensors["period_in_force_s"]) == (9, 0.25)
     assert sensors["latched_faults"] == claimed.map.fault_mask("watchdog")  # the claim clears nothing
-    with refused(6):  # the one before has lost it, also while the fault stays latched
+    with refused(6):  # the former holder has lost it, although the fault stays latched
         claimed.command(0.3, 2)
     claimed.at(PERIOD_S + 1e-3 + 0.25)
     assert claimed.state.held
@@ -381,7 +381,7 @@ def test_anybody_may_stop_and_only_the_holder_clears_it(claimed: Bench) -> None:
     with refused(6):
         claimed.put("reset", clear_faults=0xFFFF, clear_key=9)
     claimed.clear()
-    assert claimed.state.pump_fraction == 0.0  # nothing starts by being cleared
+    assert claimed.state.pump_fraction == 0.0  # clearing starts nothing
     claimed.command(0.5, 3)
     assert claimed.state.pump_fraction == 0.5
 

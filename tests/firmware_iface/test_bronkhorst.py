@@ -267,7 +267,7 @@ def test_no_wrong_value_is_accepted_under_random_faults(protocol: Callable[[Inst
             try:
                 assert await parameters.number(SETPOINT) == true
                 accepted[0] += 1
-            except LinkDownError:  # too many failures in a row: whoever owns the link opens it again
+            except LinkDownError:  # too many failures in a row: the link's owner reopens it
                 await parameters.connect()
             except LinkError:
                 refused[0] += 1
@@ -302,7 +302,7 @@ def test_the_vendors_own_master_reads_and_writes_the_emulator(
         answers += [instrument.readParameter(205), instrument.readParameter(92)]
         instrument.master.propar.run = False
         instrument.master.propar.serial_read_thread.join()
-        # the handler's thread has no end of its own and asks every millisecond: from now on it waits
+        # the handler's thread never ends and polls every millisecond: from now on it waits
         instrument.master.propar.read_propar_message = threading.Event().wait
         instrument.master.propar.serial.close()
         return answers

@@ -1,4 +1,4 @@
-"""Two programs and one board: only who has claimed it moves gas, anybody may stop it, and each sees what happened.
+"""Two programs and one board: only the holder of the claim moves gas, anybody may stop it, and each sees why.
 
 The other program is a plain pymodbus client that knows docs/registers.md and nothing of our driver.
 """
@@ -31,7 +31,7 @@ ILLEGAL_ADDRESS, ILLEGAL_VALUE, BUSY = 2, 3, 6
 
 
 class Plain:
-    """A program of somebody else's, with a claim of its own."""
+    """A foreign program, with its own claim."""
 
     def __init__(self, port: int, name: int = 0xAAAA_0001, key: int = 0xBBBB_0002) -> None:
         self._client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=5, retries=0, reconnect_delay=0)
@@ -115,7 +115,7 @@ async def test_another_program_cannot_pump_feed_arm_disarm_or_clear(
 async def test_what_the_sensors_show_does_not_help_to_command(
     holder: PumpBoard, other: Plain, board: PumpBoardEmulator
 ) -> None:
-    """The claim's name is there to be compared, not to be used."""
+    """The claim's name serves for comparison only."""
     name = int.from_bytes(b"".join(word.to_bytes(2, "big") for word in (await other.sensors())[23:25]), "big")
     thief = await Plain(board.port, name=name, key=name).connect()
     assert (await thief.claim(), await thief.command(50_000)) == (BUSY, BUSY)
@@ -219,7 +219,7 @@ async def test_a_claim_whose_answer_was_lost_is_made_again_by_the_same_driver(
 
     def deaf(address: int, words: list[int]) -> None:
         write(address, words)
-        board.faults.silent = True  # carried out, and the answer is lost
+        board.faults.silent = True  # executed, but the answer is lost
 
     monkeypatch.setattr(board.state, "write", deaf)
     with pytest.raises(LinkError):

@@ -35,7 +35,7 @@ class NoWatchdog(BoardState):
 
 
 class HoldsLastValue(BoardState):
-    """Trips and says so, and goes on with the last command."""
+    """Trips and reports it, but continues with the last command."""
 
     @property
     def pump_fraction(self) -> float:
@@ -50,7 +50,7 @@ class HoldsLastValue(BoardState):
 
 
 class AcceptsOutOfRange(BoardState):
-    """Says yes to any value, without doing anything about it."""
+    """Accepts any value, without applying it."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
         try:
@@ -72,7 +72,7 @@ class AnyWriteFeeds(BoardState):
 
 
 class DisarmsAnyTime(BoardState):
-    """Lets itself be disarmed with the pump running."""
+    """Can be disarmed with the pump running."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
         if address == 48 and words[1] == 0:
@@ -88,7 +88,7 @@ class Frozen(BoardState):
 
 
 class ForgetsPeriod(BoardState):
-    """Says yes to a watchdog period and keeps its own."""
+    """Accepts a watchdog period but keeps its own."""
 
     def write(self, address: int, words: Sequence[int]) -> None:
         super().write(address, words)
@@ -96,7 +96,7 @@ class ForgetsPeriod(BoardState):
 
 
 class StartsWhenCleared(BoardState):
-    """Goes on with the last command as soon as the fault is cleared."""
+    """Continues with the last command as soon as the fault is cleared."""
 
     last = 0.0
 
@@ -109,7 +109,7 @@ class StartsWhenCleared(BoardState):
 
 
 class Claimless(BoardState):
-    """Obeys whoever writes."""
+    """Obeys every program."""
 
     def _check_claim(self, block: str, written: dict[str, float]) -> None:
         pass
@@ -124,7 +124,7 @@ class ClaimedForEver(BoardState):
 
 
 class HalfKey(BoardState):
-    """Looks at the low word of a key only."""
+    """Compares only the low word of a key."""
 
     def _check_claim(self, block: str, written: dict[str, float]) -> None:
         low = {name: float(int(value) & 0xFFFF) for name, value in written.items() if name.endswith("_key")}

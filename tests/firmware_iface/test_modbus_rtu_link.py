@@ -1,4 +1,4 @@
-"""Modbus RTU: frames byte by byte, and answers that come late, wrong, by halves or not at all. In virtual time."""
+"""Modbus RTU: frames byte by byte, and answers that are late, wrong, incomplete or missing. In virtual time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TIMEOUT_S = 0.05
 
 
 class Words:
-    """A table of registers that remembers what was asked of it."""
+    """A table of registers that remembers its requests."""
 
     def __init__(self) -> None:
         self.words = list(range(100, 120))
@@ -150,7 +150,7 @@ def test_no_answer_with_up_to_three_turned_bits_passes(bits: int) -> None:
             taken = take_reply(bytes(spoilt), 1, 3, 9, "reading")
         except LinkError:
             continue
-        assert taken is None  # a hit length byte leaves it waiting for more
+        assert taken is None  # a corrupted length byte leaves it waiting for more
 
 
 def test_reads_and_writes() -> None:

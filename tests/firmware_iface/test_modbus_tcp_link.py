@@ -1,4 +1,4 @@
-"""The guarded link against servers that answer wrongly, late, by halves or not at all."""
+"""The guarded link against servers whose answers are wrong, late, incomplete or missing."""
 
 from __future__ import annotations
 

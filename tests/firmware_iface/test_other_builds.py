@@ -1,4 +1,4 @@
-"""Instruments that keep to their manuals in other ways than our emulators: line ends, echo, junk at power-up."""
+"""Instruments that follow their manuals in other ways than our emulators: line ends, echo, junk at power-up."""
 
 from __future__ import annotations
 

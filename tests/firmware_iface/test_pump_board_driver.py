@@ -1,4 +1,4 @@
-"""The driver against the emulated board: the whole way from SI values through bytes and back, and every fault."""
+"""The driver against the emulated board: from SI values to bytes and back, and every fault."""
 
 from __future__ import annotations
 
@@ -369,7 +369,7 @@ def _random_fault(source: random.Random) -> Faults:
 
 
 async def _reopen(driver: PumpBoard) -> None:
-    """Open as an owner does: again and again; on a busy machine 10 ms may be short even for a healthy board."""
+    """Open like an owner, again and again: on a busy machine 10 ms may be short even for a healthy board."""
     for _ in range(10):
         try:
             await driver.open()

@@ -1,4 +1,4 @@
-"""The pump board on a serial line: our driver, and a plain client of a library that is not ours."""
+"""The pump board on a serial line: our driver, and a plain client of another library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made from the register map is up to date, and says the same as the map."""
+"""The files generated from the register map are up to date and agree with it."""
 
 from __future__ import annotations
 

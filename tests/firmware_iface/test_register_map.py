@@ -1,4 +1,4 @@
-"""The register map: what it refuses, and that values survive the way through registers."""
+"""The register map: what it refuses, and that values survive conversion to registers and back."""
 
 from __future__ import annotations
 

@@ -297,7 +297,7 @@ def test_the_watchdog_survives_whatever_a_driver_raises(error: Exception) -> Non
 
 
 def dead_watchdog(devices: Devices) -> None:
-    """Ends it as a defect of the program would."""
+    """End it as a program defect would."""
     assert devices.bench._watchdog is not None
     devices.bench._watchdog.cancel()
 
@@ -315,7 +315,7 @@ def test_a_watchdog_that_ended_stops_the_pump_and_is_a_lost_bench_at_the_next_ca
         assert devices.pump.value == 0.0
         await devices.bench.open()
         reading = await devices.bench.read()
-        assert reading.watchdog_tripped  # a person's, or the resume rule's, to clear
+        assert reading.watchdog_tripped  # cleared only by a person or the resume rule
         await devices.bench.write(BenchCommand(0.7, 0.0))
         assert devices.pump.value == 0.0
         await devices.bench.clear_faults(0xFFFF)

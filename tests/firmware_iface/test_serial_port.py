@@ -1,4 +1,4 @@
-"""Serial ports on pseudo-terminals: what the kernel says of a port, and names that outlive a replug."""
+"""Serial ports on pseudo-terminals: what the kernel reports of a port, and names that survive a replug."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ GUARD_S = 5.0
 
 
 class Echo(SerialDevice):
-    """Says what it hears."""
+    """Echoes its input."""
 
     def received(self, data: bytes) -> None:
         self.say(data)
 
 
 class Ear:
-    """Keeps what it is told."""
+    """Keeps its input."""
 
     def __init__(self) -> None:
         self.data = b""

@@ -174,7 +174,7 @@ def test_each_fault_is_an_error_and_passes(faults: SerialFaults) -> None:
             with pytest.raises(LinkError):
                 await bench.driver.set_pump(0.3)
         bench.emulator.faults = SerialFaults()
-        await asyncio.sleep(1.0)  # what is late comes, and is nobody's
+        await asyncio.sleep(1.0)  # the late answer comes and is discarded
         await bench.driver.set_pump(0.4)
         assert bench.driven[-1] == 0.4
 

@@ -135,7 +135,7 @@ class Room:
                     good_tuning(folder)
 
     def run(self, one: Case) -> str:
-        """What is wrong with a case; empty if nothing is."""
+        """The fault of a case; empty if there is none."""
         from mutations import CANARY, spoil
 
         from membrane_ctrl.cli import run
@@ -156,7 +156,7 @@ class Room:
             spoil(inside, rng)
         else:
             spoil(inside / self._run_name, rng)
-            if one.command.name.startswith("runs"):  # one bad folder must not take the list of the good ones away
+            if one.command.name.startswith("runs"):  # one bad folder must not hide the good ones from the list
                 shutil.copytree(self._good / "logs" / self._run_name, inside / "20261122T000000Z-good")
         before = _outside(place)
         words = [self._word(word, inside, rng) for word in one.command.words]

@@ -1,4 +1,4 @@
-"""What a stranger, a bad disk or a careless hand may make of a good folder; every change from a seed."""
+"""What a stranger, a bad disk or a careless person may do to a good folder; every change from a seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders and capture sets made to do harm, one each of what was found; and a small share of the fuzzer."""
+"""Run folders and capture sets made to do harm, one for each finding; and a small share of the fuzzer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A geometry in a file: read, applied, refused; and the one that a run measures with."""
+"""A geometry in a file: read, applied, refused; and the geometry of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the board itself has latched when a hold begins: refused, waited for, or cleared as the resume rule allows."""
+"""Faults latched by the board when a hold begins: refused, waited for, or cleared as the resume rule allows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `hold` says at its end of a run folder that is not what it was."""
+"""What `hold` reports at its end about a changed run folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A latched fault in standby: no hold before somebody has acknowledged it."""
+"""A latched fault in standby: no hold before a person acknowledges it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A child process is replaced: at once, then later and later, not for ever."""
+"""A child process is replaced: at once, then after growing pauses, not for ever."""
 
 from __future__ import annotations
 

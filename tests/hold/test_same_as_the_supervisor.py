@@ -1,4 +1,4 @@
-"""The supervisor's own loop gives what a virtual run gives, which steps it: the same rows to the bit."""
+"""The supervisor's own loop gives the same rows, to the bit, as a virtual run that steps it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every scenario file, and what the loader says of files that are none."""
+"""Every scenario file, and the loader's errors for invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The supervisor writes the controller's memory down now and then, and a replay can begin with it."""
+"""The supervisor records the controller's memory now and then, and a replay can begin with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What systemd is told, on a socket of our own; and the unit file."""
+"""The notifications to systemd, on our own socket; and the unit file."""
 
 from __future__ import annotations
 

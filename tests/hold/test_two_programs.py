@@ -1,4 +1,4 @@
-"""A second program on the board of a running hold: what it may do, and what the hold makes of it."""
+"""A second program on the board of a running hold: what it may do, and how the hold reacts."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_hold_that_lost_its_board_sees_it_in_its_next_tick_and_never_takes_it_
     (first,) = story.go_on(0.1)
     assert faults([first]) == ["board_taken"]
     assert first.outputs.command.pump_fraction == 0.0
-    assert story.bench.board.pump_fraction == 0.2  # the other one's, who answers for it
+    assert story.bench.board.pump_fraction == 0.2  # the other program's, which is responsible for it
     later = story.go_on(5.0)
     assert {tick.outputs.command.pump_fraction for tick in later} == {0.0}
     story.stall(11.0)  # also the other one's claim lapses

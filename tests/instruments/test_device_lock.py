@@ -1,4 +1,4 @@
-"""One program a device: however two configurations name it, and whatever became of the other program."""
+"""One program a device: however two configurations name it, and however the other program ended."""
 
 from __future__ import annotations
 

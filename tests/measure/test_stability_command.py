@@ -1,4 +1,4 @@
-"""`stability` from the command line: against the known motion of the film, past bad sets, and with its errors."""
+"""`stability` from the command line: against the film's known motion, with bad sets, and its errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bins' rays, areas, and what averaging over a bin does."""
+"""The bins' rays and areas, and the effect of averaging over a bin."""
 
 from __future__ import annotations
 

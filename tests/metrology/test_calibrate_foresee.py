@@ -1,4 +1,4 @@
-"""What sets will determine, foreseen, against what rendered sets of a rippled film claim."""
+"""The predicted uncertainty of sets against the claims of rendered sets of a rippled film."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ SEEDS = range(12)
 
 
 def drawn(seed: int) -> np.ndarray:
-    """Parameters off by what is known of them."""
+    """Parameters off by their hand measurements' sigmas."""
     return SIGMAS * np.random.default_rng(1000 + seed).normal(size=len(NAMES))
 
 
@@ -114,7 +114,7 @@ def test_what_is_not_determined_is_named() -> None:
     shifted = [each for each in weak if any(name == "screen_x_mm" for name, _ in each.parts)]
     assert shifted
     assert "a tilt of the surface" in shifted[0].words
-    # the figure hardly sees it
+    # it hardly affects the figure
     assert shifted[0].figure_um < 0.1 * shifted[0].height_um
 
 

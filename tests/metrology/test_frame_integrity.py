@@ -1,4 +1,4 @@
-"""Every frame x every fault is named, by data the checker has never seen; good sets of all kinds raise no alarm."""
+"""Every frame x every fault is named, on data new to the checker; good sets of all kinds raise no alarm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live cycle on frames that the twin renders: an exact forward model that shares no code with the inverse."""
+"""The live cycle on frames rendered by the twin, an exact forward model that shares no code with it."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_fringes_follow_the_film(displacement_um: float) -> None:
 
 
 def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
-    """1.2 mm in steps of 300 um: more than a fringe in all, less than half of one at a time."""
+    """1.2 mm in steps of 300 um: more than a fringe in all, less than half a fringe per step."""
     live = _live()
     for displacement_um in (300.0, 600.0, 900.0, 1200.0):
         estimate = live.fringes(*_render("fringes", displacement_um))
@@ -226,14 +226,14 @@ def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     live = _live(bin_px=2)
     estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
     sags = np.array([e.sag_um for e in estimates])
-    assert sags.std() == pytest.approx(estimates[0].sag_sigma_um, rel=0.3)  # 60 cycles tell a sigma to 9 %
+    assert sags.std() == pytest.approx(estimates[0].sag_sigma_um, rel=0.3)  # 60 cycles give a sigma to 9 %
     coeffs = np.array([e.coeffs_um for e in estimates])
     ratio = coeffs.std(axis=0) / np.sqrt(np.diag(estimates[0].covariance_um2))
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.15)
 
 
 def test_same_frames_give_the_same_figure() -> None:
-    """But for the last bits: the library's small products depend on where in memory an array happens to lie."""
+    """Except for the last bits: the library's small products depend on an array's place in memory."""
     cycles = [_render("full"), *(_render("fringes", d) for d in (1.0, -2.0))]
     runs = []
     for _ in range(2):

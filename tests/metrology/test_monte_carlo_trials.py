@@ -1,4 +1,4 @@
-"""Cheap trials against what they stand for: whole measurements with new noise, and with another geometry."""
+"""Cheap trials against whole measurements with new noise, and with another geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A screen that is no plane: heights of the map, rays to it, and the figure that comes out with and without it."""
+"""A screen that is no plane: heights of the map, rays to it, and the figure with and without it."""
 
 from __future__ import annotations
 

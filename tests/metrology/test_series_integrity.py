@@ -1,4 +1,4 @@
-"""Frames of a multi-frequency set, simulated: each fault is named, mended where it can be, and good sets pass."""
+"""Simulated frames of a multi-frequency set: each fault is named and repaired where possible; good sets pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reader of SOFAST files: what is wrong with a file is said in one line that names it."""
+"""Reader of SOFAST files: one line names a file and its fault."""
 
 import os
 import sys

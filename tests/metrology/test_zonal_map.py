@@ -1,4 +1,4 @@
-"""The zonal map: least-squares height on masks, with parts that do not hang together."""
+"""The zonal map: least-squares height on masks, with disconnected parts."""
 
 from __future__ import annotations
 

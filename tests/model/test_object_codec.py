@@ -1,4 +1,4 @@
-"""Objects as plain data: exact both ways, and nothing comes back that a class does not declare."""
+"""Objects as plain data: exact both ways, and nothing returns that a class does not declare."""
 
 from __future__ import annotations
 

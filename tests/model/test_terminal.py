@@ -1,4 +1,4 @@
-"""No control byte of a stranger reaches a terminal, and what is JSON stays JSON."""
+"""No stranger's control byte reaches a terminal, and JSON stays JSON."""
 
 from __future__ import annotations
 

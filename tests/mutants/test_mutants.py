@@ -1,4 +1,4 @@
-"""The list of mutants is about the code as it is."""
+"""The list of mutants matches the present code."""
 
 from __future__ import annotations
 

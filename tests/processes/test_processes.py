@@ -1,4 +1,4 @@
-"""A child is out of reach of what its group is sent, and never left behind."""
+"""A child is unaffected by signals to its group, and never left behind."""
 
 from __future__ import annotations
 

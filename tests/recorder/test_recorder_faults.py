@@ -1,4 +1,4 @@
-"""A recorder whose disk or data goes bad: it says so, loses as little as it can, and goes on."""
+"""A recorder whose disk or data fails: it reports this, loses as little as possible, and continues."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recorder as it runs: its own process, real rings, and the faults it must outlive."""
+"""The recorder as it runs: its own process, real rings, and the faults it must survive."""
 
 from __future__ import annotations
 

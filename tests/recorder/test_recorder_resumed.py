@@ -1,4 +1,4 @@
-"""A recorder dies in the middle of a run; the next one goes on, and the run has everything once."""
+"""A recorder dies in the middle of a run; the next one continues, and the run has everything once."""
 
 from __future__ import annotations
 

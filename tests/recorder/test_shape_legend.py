@@ -1,4 +1,4 @@
-"""What the recording says of a cycle in words."""
+"""The recording's text about a cycle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recording opens in the viewer as arranged; needs the headless viewer."""
+"""The recording opens in the viewer with its layout; needs the headless viewer."""
 
 from __future__ import annotations
 

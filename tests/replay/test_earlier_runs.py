@@ -1,4 +1,4 @@
-"""A run recorded by an earlier version stays readable; its pickled memories are passed over, never unpickled."""
+"""A run of an earlier version stays readable; its pickled memories are skipped, never unpickled."""
 
 from __future__ import annotations
 

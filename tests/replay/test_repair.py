@@ -1,4 +1,4 @@
-"""Repair: what a crash can have torn, cut at every kind of place; originals stay unless asked."""
+"""Repair: files torn by a crash, cut at every kind of place; originals stay unless requested otherwise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replay: what a tick was given comes back to the last bit, and so does what it decided."""
+"""Replay: a tick's inputs return to the last bit, and so do its decisions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a replay differs from the record: what is said of decisions and of fields."""
+"""Where a replay differs from the record: the report on decisions and fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests behind a comparison: what is alike seldom differs, what differs is seen, rows say what they know."""
+"""The tests of a comparison: alike runs seldom differ, differences are found, rows state their test."""
 
 from __future__ import annotations
 

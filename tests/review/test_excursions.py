@@ -1,4 +1,4 @@
-"""The band left with and without something that explains it."""
+"""Excursions from the band with and without an explanation."""
 
 from __future__ import annotations
 

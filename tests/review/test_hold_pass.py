@@ -1,4 +1,4 @@
-"""What single ticks say: blind ticks, parts, thinned ticks."""
+"""Figures of single ticks: blind ticks, parts, thinned ticks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Laser glitches of all lengths, and what is none."""
+"""Laser glitches of all lengths, and other events."""
 
 from __future__ import annotations
 

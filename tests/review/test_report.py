@@ -1,4 +1,4 @@
-"""The report: its figures against what was put in, its page, comparisons."""
+"""The report: its figures against known inputs, its page, comparisons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report of a part knows nothing of what was outside of it, and is set against what it says."""
+"""A report of a part ignores the rest of the run, and is compared as stated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a review of a part shows: its lines, its maps, and the time cursor there."""
+"""A review of a part shows its lines, its maps, and the time cursor there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Catalogue, export, marks, moments, and what the viewer is given."""
+"""Catalogue, export, marks, moments, and the viewer's input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables that a killed recorder leaves, and that the next one goes on with: every row once."""
+"""Tables left by a killed recorder and continued by the next one: every row once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's configuration that this version does not understand wholly, or that is gone."""
+"""A run's configuration that this version understands only in part, or that is missing."""
 
 from __future__ import annotations
 

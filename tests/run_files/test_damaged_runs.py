@@ -1,4 +1,4 @@
-"""Runs whose files were damaged: what is missing is said, the rest is shown, and nothing of the run is touched."""
+"""Runs with damaged files: gaps are named, the rest is shown, and nothing of the run is touched."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is left out when the disk runs low, and which old runs go."""
+"""What is omitted when the disk runs low, and which old runs are deleted."""
 
 from __future__ import annotations
 

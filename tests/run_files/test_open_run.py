@@ -1,4 +1,4 @@
-"""Reading runs back: what was recorded, and what is left of runs that ended badly."""
+"""Reading runs back: the record, and the remains of runs that ended badly."""
 
 from __future__ import annotations
 

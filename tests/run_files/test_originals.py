@@ -1,4 +1,4 @@
-"""What a user asks of review never costs anything that the recorder wrote, and marks are what was said."""
+"""No review command harms the recorder's files, and marks are as given."""
 
 from __future__ import annotations
 

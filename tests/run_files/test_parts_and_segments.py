@@ -1,4 +1,4 @@
-"""Which Rerun segments a part of a run reads: none that the tables make needless, and none far away."""
+"""Which Rerun segments a part of a run reads: none that the tables replace, and none far away."""
 
 from __future__ import annotations
 

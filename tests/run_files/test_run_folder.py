@@ -1,4 +1,4 @@
-"""The run's folder: its name, its configuration, and what is said when it cannot be made."""
+"""The run's folder: its name, its configuration, and the errors when it cannot be made."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def test_serves_the_plant_in_real_time_and_publishes_the_truth() -> None:
         process.join(START_S)
         assert process.exitcode == 0
     device_s = device_time_s(last) - device_time_s(first)
-    assert 0.5 < device_s < ended_s  # how exactly time is kept is tested on a virtual clock
+    assert 0.5 < device_s < ended_s  # a virtual clock tests how exactly time is kept
     assert last["sample_counter"] - first["sample_counter"] == pytest.approx(device_s / 0.005, abs=1.01)
     assert last["pump_readback_fraction"] == 1.0
     assert max(truth.pump_um_per_s for truth in truths) == pytest.approx(5.3, rel=0.05)

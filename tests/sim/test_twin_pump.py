@@ -1,4 +1,4 @@
-"""The pump adds only, sticks, stalls and answers late; the plant around it fills in two hours."""
+"""The pump only adds, sticks, stalls and responds late; the plant around it fills in two hours."""
 
 from __future__ import annotations
 

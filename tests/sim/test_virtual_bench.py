@@ -60,13 +60,13 @@ def test_switches_of_the_link(bench: VirtualBench) -> None:
     bench.wrong.silent = True
     with pytest.raises(LinkError, match="no answer"):
         bench.write(BenchCommand(0.4, 0.0))
-    assert bench.board.pump_fraction > 0.3  # carried out all the same
+    assert bench.board.pump_fraction > 0.3  # executed nevertheless
     bench.wrong.silent, bench.wrong.unreachable = False, True
     with pytest.raises(LinkDownError):
         bench.read()
     bench.wrong.unreachable = False
     with pytest.raises(LinkDownError):
-        bench.read()  # not connected again by itself
+        bench.read()  # does not reconnect by itself
     bench.open()
     assert math.isfinite(bench.read().displacement_um)
 

@@ -1,4 +1,4 @@
-"""Things that happen to the simulated bench at a time; each adds itself to what the surroundings do."""
+"""Events of the simulated bench at a time; each adds its effect to the surroundings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class AirTemperatureChange:
 
 @dataclass(frozen=True, slots=True)
 class LeakChange:
-    """The leak becomes `factor` times what it was."""
+    """The leak grows by `factor`."""
 
     at_s: float
     factor: float = 2.0
@@ -66,14 +66,14 @@ class LaserDropout:
 
 @dataclass(frozen=True, slots=True)
 class LaserDrift:
-    """The laser's mount moves at a rate for a while; where it got to, it stays."""
+    """The laser's mount moves at a rate for a while, then stays."""
 
     at_s: float
     rate_um_per_min: float
     duration_s: float = math.inf
 
     def apply(self, on: Surroundings) -> None:
-        """Add the way so far."""
+        """Add the motion so far."""
         on.laser_bias_um[:] += self.rate_um_per_min / 60 * np.clip(on.time_s - self.at_s, 0, self.duration_s)
 
 

@@ -1,4 +1,4 @@
-"""`inputs-NNN.bin` as the recorder of version 0.1 wrote them: what a tick was given, a frame a second."""
+"""`inputs-NNN.bin` as the recorder of version 0.1 wrote them: a tick's inputs, a frame a second."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ class Paraboloid:
 
 @dataclass(frozen=True)
 class ParaboloidFit:
-    """A paraboloid and what it leaves.
+    """A paraboloid and its residual.
 
     Attributes
     ----------
@@ -232,7 +232,7 @@ def solve_facet(geometry: Geometry, sight: Sight, loss: Loss = "squares") -> Fac
         fit = fit_slopes(points_mm[0], points_mm[1], slopes, loss)
         if max(abs(fit.surface.tilt_x), abs(fit.surface.tilt_y)) < _TILT_TOLERANCE:
             return FacetFit(fit, geometry, points_mm, slopes)
-        surface = replace(fit.surface, tilt_x=0.0, tilt_y=0.0)  # the turn below takes the tilt out
+        surface = replace(fit.surface, tilt_x=0.0, tilt_y=0.0)  # the turn below removes the tilt
         geometry = turned(geometry, _normal_to_z(fit.surface))
     raise ValueError(f"the facet's tilt did not settle in {_MAX_ROUNDS} rounds")
 

@@ -100,7 +100,7 @@ def _limit(limit: str) -> str:
 
 
 def alarms() -> str:
-    """Every alarm with what to do, as Markdown."""
+    """Every alarm with its remedy, as Markdown."""
     lines = [_BEGIN, "", "| alarm | what it means | what to do |", "|---|---|---|"]
     lines += [f"| {rule.code} `{rule.name}` | {rule.cause} | {rule.remedy} |" for rule in _by_urgency()]
     return "\n".join([*lines, "", _END])

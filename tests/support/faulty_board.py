@@ -13,17 +13,17 @@ from firmware_iface.emulators.modbus_server import Answer, exception_pdu
 
 @dataclass(slots=True)
 class Faults:
-    """What is wrong with the emulated board; each can be switched on and off while it runs."""
+    """Faults of the emulated board; each can be switched on and off while it runs."""
 
-    silent: bool = False  # requests are carried out and not answered
+    silent: bool = False  # requests are executed but not answered
     delay_s: float = 0.0  # answers come this much later
     frozen: bool = False  # the sensor block stays as it was (counter and time too)
     no_displacement: bool = False  # the laser has no value
-    exception_code: int = 0  # every request is answered with this Modbus exception and not carried out; 0: off
-    map_version: int = 0  # what the board says of its map; 0: the true one
+    exception_code: int = 0  # every request gets this Modbus exception and is not executed; 0: off
+    map_version: int = 0  # the map version that the board reports; 0: the true one
     hang_up: bool = False  # the connection is dropped at every request
-    short_reply: bool = False  # reads answer with one register too few, in a frame that is otherwise right
-    wrong_function: bool = False  # answers carry function code 23 in place of 3, and 6 in place of 16
+    short_reply: bool = False  # answers to reads have one register too few, in an otherwise correct frame
+    wrong_function: bool = False  # answers have function code 23 instead of 3, and 6 instead of 16
     wrong_transaction: bool = False  # answers carry another transaction id
 
 

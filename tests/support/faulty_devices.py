@@ -15,23 +15,23 @@ from firmware_iface.roles import LinkDownError
 
 @dataclass(slots=True)
 class SerialFaults:
-    """What is wrong with the line or the device; each can be switched on and off while it runs."""
+    """Faults of the line or the device; each can be switched on and off while it runs."""
 
-    silent: bool = False  # questions are carried out and not answered
+    silent: bool = False  # questions are executed but not answered
     deaf: bool = False  # questions do not arrive
-    # answers come this much later; longer than the asker waits, it is a late reply. Answers keep their order
+    # delay of answers; beyond the asker's time-out the reply is late. Answers keep their order
     delay_s: float = 0.0
-    garbage_bytes: int = 0  # so many random bytes in place of each answer
-    # so many bits of each answer are turned over. On a line with parity, a byte with an odd number of them is
-    # dropped, as the receiver does
+    garbage_bytes: int = 0  # so many random bytes instead of each answer
+    # so many bits of each answer are flipped. On a line with parity, a byte with an odd number of them is dropped, as
+    # the receiver does
     bit_errors: int = 0
-    question_bit_errors: int = 0  # so many bits of each question are turned over
+    question_bit_errors: int = 0  # so many bits of each question are flipped
     cut_bytes: int = 0  # so many bytes are missing at the end of each answer
-    frozen: bool = False  # the measured value stays what it was
+    frozen: bool = False  # the measured value does not change
 
 
 class SerialDevice(serial_device.SerialDevice):
-    """A device whose answers and questions are spoilt on their way, as `faults` says.
+    """A device whose answers and questions are corrupted on their way, according to `faults`.
 
     `draw_faults`, when set, is called for every question, and for every answer: random faults.
     """
@@ -62,7 +62,7 @@ class SerialDevice(serial_device.SerialDevice):
         return self._hit(answer[: max(0, len(answer) - faults.cut_bytes)], faults.bit_errors)
 
     def _hit(self, data: bytes, bit_errors: int) -> bytes:
-        """With so many bits turned over, as the receiver at the other end gets it."""
+        """The bytes with flipped bits, as the receiver gets them."""
         if not bit_errors:
             return data
         spoilt, hits = bytearray(data), bytearray(len(data))
@@ -141,7 +141,7 @@ class MemoryWire(SerialPort):
 
     @property
     def retry_in_s(self) -> float:
-        """It may be tried at any time."""
+        """No wait between attempts."""
         return 0.0
 
     def open(self, receiver: Receiver) -> None:

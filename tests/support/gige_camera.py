@@ -25,7 +25,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 # registers of arvfakecamera.h
 _SENSOR_WIDTH, _SENSOR_HEIGHT, _WIDTH, _HEIGHT = 0x11C, 0x118, 0x100, 0x104
-# How often the library's thread looks whether it was triggered; its own 25 Hz would delay each frame by 40 ms
+# How often the library's thread checks for a trigger; its own 25 Hz would delay each frame by 40 ms
 _TRIGGER_LOOKS_HZ = 500.0
 _GVCP_PORT = 3956  # GigE Vision control, fixed by the standard
 _FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
@@ -40,7 +40,7 @@ class GigeCameraEmulator:
     ----------
     expose : callable
         (exposure_ms, gain) -> (height, width) pixels, uint8 or uint16; called from the camera's own thread at every
-        exposure. What it raises is kept in `error`, and the frame is black.
+        exposure. An exception is kept in `error`, and the frame is black.
     width_px, height_px : int
         Size of the sensor.
     address : str
@@ -76,7 +76,7 @@ class GigeCameraEmulator:
 
     @property
     def camera_id(self) -> str:
-        """What names it to the driver."""
+        """Its name for the driver."""
         return self._address
 
     def plug_in(self) -> None:
@@ -106,7 +106,7 @@ class GigeCameraEmulator:
         call("arv_fake_camera_set_fill_pattern", inner, ctypes.cast(self._fill, c_void_p), None)
 
     def _look_whether_free(self) -> None:
-        """The library does not say when its port is taken: it then listens to nobody."""
+        """Check the port: if it is taken, the library stays silent and listens to nobody."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind((self._address, _GVCP_PORT))
@@ -114,7 +114,7 @@ class GigeCameraEmulator:
                 raise LinkError(f"emulated camera: {self._address} port {_GVCP_PORT}: {error.strerror}") from None
 
     def unplug(self) -> None:
-        """Vanish, with all settings and whoever was in control."""
+        """Vanish, with all settings and the controlling client."""
         if self._camera is not None:
             self._aravis.call("g_object_unref", self._camera)
             self._camera = None

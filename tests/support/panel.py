@@ -25,7 +25,7 @@ class PanelResponse:
 
 
 class EmulatedPanel(Generic[Image]):
-    """What is lit on the panel.
+    """The panel's light.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class EmulatedPanel(Generic[Image]):
             shares.append((left * (1.0 - dark), image))
             left *= dark
         if shares:
-            shares[-1] = (shares[-1][0] + left, shares[-1][1])  # what was before is long gone
+            shares[-1] = (shares[-1][0] + left, shares[-1][1])  # earlier images have long faded
         return shares
 
     def _mean_left(self, from_s: float, exposure_s: float) -> float:

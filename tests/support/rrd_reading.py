@@ -43,14 +43,14 @@ def entities(path: Path) -> set[str]:
 
 
 def reader(path: Path) -> RrdReader:
-    """A reader that takes a file without footer in silence."""
+    """A reader that accepts a file without footer silently."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return RrdReader(path)
 
 
 def has_footer(path: Path) -> bool:
-    """Whether the file was closed in order."""
+    """Whether the file was closed properly."""
     try:
         reader(path).store()
     except (RuntimeError, ValueError):

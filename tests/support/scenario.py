@@ -1,4 +1,4 @@
-"""Scenario files: what happens to a simulated bench and when, and what must come of it. One TOML file each.
+"""Scenario files: what happens to a simulated bench and when, and the expected outcome. One TOML file each.
 
 [config.twin]            # what differs from the default configuration
 scenario = "calm"
@@ -55,7 +55,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 from tests.support import bench_events as happenings
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(Wrong)}
-_FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # beyond them the plant has no answer
+_FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
 Happening = Literal["ambient", "air_temperature", "leak", "laser_dropout", "laser_drift", "power_cycle"]
 _MAKE: dict[str, Callable[[At], happenings.BenchEvent]] = {
     "ambient": lambda at: happenings.AmbientChange(at.time_s, at.value, at.over_s),
@@ -119,7 +119,7 @@ class Bound(Section):
 
 
 class Expectation(Section):
-    """What must come of it; what is left out is not looked at."""
+    """The expected outcome; omitted keys are not checked."""
 
     exit: Literal["done", "safety_trip", "device_failed", "interrupted"] | None = None
     states: tuple[str, ...] | None = None
@@ -151,7 +151,7 @@ class Scenario(Section):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a scenario.
+    """Result of a scenario.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class Outcome:
     events : tuple of dict
         All events, with `mono_s`.
     bench : VirtualBench
-        As it was left.
+        State at the end.
     """
 
     ticks: tuple[VirtualTick, ...]
@@ -173,12 +173,12 @@ class Outcome:
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario. Raises InputError: one line that names the file, the field and what would be right."""
+    """Read a scenario. Raises InputError: one line that names the file, the field and a valid value."""
     return load(path, Scenario)
 
 
 def play(scenario: Scenario) -> Outcome:
-    """Run a scenario in virtual time, from the wish to hold until its end and 5 s of aftermath."""
+    """Run a scenario in virtual time, from the command `hold` until its end and 5 s of aftermath."""
     config = scenario.config
     steps = sorted(scenario.at, key=lambda at: at.time_s)
     plant = Plant(config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE))
@@ -206,7 +206,7 @@ def play(scenario: Scenario) -> Outcome:
 
 
 def failures(expect: Expectation, outcome: Outcome) -> Iterator[str]:
-    """What did not come as expected, a line each."""
+    """Deviations from the expected outcome, a line each."""
     finished = outcome.ticks[-1].outputs.finished if outcome.ticks else None
     exit_name = "none" if finished is None else finished.name.lower()
     found: list[tuple[str, Any, Any]] = [
@@ -229,7 +229,7 @@ Due = Command | Callable[[VirtualBench], None]
 
 
 def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
-    """What is to be done when; a switch goes back by itself when its time is over."""
+    """Actions by time; a switch returns when its time is over."""
     for at in steps:
         if at.command is not None:
             command = Command(at.command, "scenario", value=at.value, text=at.text)  # type: ignore[arg-type]  # checked

@@ -1,4 +1,4 @@
-"""What SOFAST made of a measured facet, and from its frames to what each pixel sees: what our fit is compared with.
+"""SOFAST's result for a measured facet, and its frames as screen points of pixels: the reference for our fit.
 
 Vectors and rotations keep SOFAST's names: `r_cam_optic` turns a vector from camera into optic (facet) coordinates,
 `v_cam_optic_cam` leads from camera to optic, in camera coordinates.
@@ -28,7 +28,7 @@ _FACET = "DataSofastCalculation/facet/facet_000"
 
 # The screen as measured: where a fraction of it lies in mm, and what grey value it showed.
 #
-# Both are curves through calibration points; the code behind knows only the curves.
+# Both are curves through calibration points; the other code uses only the curves.
 
 
 class ScreenShape(Protocol):
@@ -114,7 +114,7 @@ class SofastCamera:
 
 @dataclass(frozen=True)
 class SofastResult:
-    """What SOFAST made of the measurement: its pose of the facet, and results to compare with.
+    """SOFAST's result for the measurement: its pose of the facet, and figures to compare with.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ def decode(measurement: SofastMeasurement, mask: NDArray[np.bool_], response: Di
 
 
 def sight(decoded: Decoded, mask: NDArray[np.bool_], camera: SofastCamera, screen: ScreenShape) -> Sight:
-    """What the pixels of `mask` see, those left out whose frequencies disagree or that look past the screen."""
+    """Screen points of the pixels of `mask`, except where frequencies disagree or the screen is missed."""
     rows_px, columns_px = (index.astype(float) for index in np.nonzero(mask))
     screen_mm = screen.screen_mm(decoded.screens)
     good = decoded.consistent & np.isfinite(screen_mm).all(axis=0)

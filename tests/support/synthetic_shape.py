@@ -1,4 +1,4 @@
-"""Shape estimates of a bowl that stands still, with numbers that use all their bits."""
+"""Shape estimates of a bowl at rest, with numbers that use all their bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Empty pictures, for tests of the words and numbers beside them: a report takes seconds to draw."""
+"""Empty pictures, for tests of the texts and numbers beside them: a report takes seconds to draw."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measurement cycle on the twin's camera in virtual time: real frames, real reconstruction, nobody waits.
+"""The measurement cycle on the twin's camera in virtual time: real frames, real reconstruction, no waiting.
 
 The film stands still while the frames of a cycle are taken (the virtual plant does not advance meanwhile); motion
 between frames is the business of runs in real time and of `simulate`.

@@ -23,7 +23,7 @@ def virtual_display(folder: Path, width_px: int, height_px: int) -> Iterator[Pat
     pytest.importorskip("pygame", reason="pip install 'membrane-ctrl[screen]'")
     number_end, server_end = os.pipe()
     command = ["Xvfb", "-displayfd", str(server_end), "-screen", "0", f"{width_px}x{height_px}x24"]
-    # without -noreset it starts anew when its last client has left, and the next may come too early for it
+    # without -noreset it resets when its last client leaves, and the next may come too early
     options = ["-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
     server = subprocess.Popen([*command, *options], pass_fds=[server_end], stderr=subprocess.DEVNULL)
     os.close(server_end)

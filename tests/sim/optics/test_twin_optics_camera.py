@@ -21,7 +21,7 @@ class Position:
 
 @dataclass
 class Bench:
-    """A film that stands where the test puts it, and a clock that stands still."""
+    """A film placed by the test, and a stopped clock."""
 
     position: Position = field(default_factory=lambda: Position(-25.0, 37.075))
     time_s: float = 5.0

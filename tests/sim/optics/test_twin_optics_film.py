@@ -1,4 +1,4 @@
-"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients of what 36 terms carry."""
+"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients that 36 terms represent."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_the_law_of_reflection_holds(film: FilmShape, error: ScreenError | None)
 
     p = np.stack([hits.x_mm, hits.y_mm, film.height_mm(hits.x_mm, hits.y_mm, 100.0) - 0.1], axis=1)
     np.testing.assert_allclose(_unit(p - camera.position_mm), directions, atol=1e-14)  # on the camera's ray
-    # slopes by a five-point difference of the heights, so that the trace's own derivatives are not what is trusted
+    # slopes by a five-point difference of the heights, independent of the trace's own derivatives
     step, weights = 0.5, np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
     offsets = np.array([-2.0, -1.0, 1.0, 2.0]) * step
 
