@@ -21,7 +21,11 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def review(
-    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="One run, or several to overlay.")],
+    runs: Annotated[
+        list[str] | None, typer.Argument(metavar="RUN...", help="One run, or several to overlay.")
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="All runs of a folder, as a table.")] = False,
+    logs: LogsOption = Path("logs"),
     at: Annotated[str | None, typer.Option(help="Open at this time: 03:12 (UTC) or +90m from the start.")] = None,
     around: Annotated[str | None, typer.Option(help="Open at the first event of this name, e.g. a fault.")] = None,
     start: FromOption = None,
@@ -41,7 +45,8 @@ def review(
 
     `review mark RUN TEXT --at 03:12` adds a mark to the timeline and the report.
     """
-    if runs[0] == "mark":  # what follows is text, too, and a path would lose its double slashes
+    runs = runs or []
+    if runs[:1] == ["mark"]:  # what follows is text, too, and a path would lose its double slashes
         from membrane_ctrl.review.runs import mark_command
 
         return mark_command(runs[1:], at)
@@ -49,7 +54,21 @@ def review(
 
     return review_command(
         ReviewOptions(
-            [Path(run) for run in runs], at, around, start, end, tab, align, live, web, bind, port, save, screenshot
+            [Path(run) for run in runs],
+            every,
+            logs,
+            at,
+            around,
+            start,
+            end,
+            tab,
+            align,
+            live,
+            web,
+            bind,
+            port,
+            save,
+            screenshot,
         )
     )
 

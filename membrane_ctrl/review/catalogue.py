@@ -34,6 +34,7 @@ class RunEntry:
     size_mb: float
     marks: int  # annotations
     kept: bool  # the folder has a file `.keep` and is never pruned
+    geometry: str  # hash of the last one in force; empty without a camera
     held_s: float = math.nan  # these are the parts of a run as `summary.HoldParts` tells them
     faults_s: float = math.nan
     paused_s: float = math.nan
@@ -89,7 +90,7 @@ def _entry_or_why(folder: Path) -> RunEntry:
     except OSError as error:
         began, why = origin_of(folder, ()), f"cannot be read ({errors.os_reason(error)})"
         nan = math.nan
-        return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False)
+        return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False, "")
 
 
 def entry(folder: Path) -> RunEntry:
@@ -97,7 +98,7 @@ def entry(folder: Path) -> RunEntry:
     notes: list[str] = []
     log = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
-    loop = run_folder.read_config(folder, notes).loop
+    config = run_folder.read_config(folder, notes)
     told, duration_s = summary.get("held"), _number(summary.get("duration_s"))
     held = told if isinstance(told, dict) else {}
     return RunEntry(
@@ -108,12 +109,13 @@ def entry(folder: Path) -> RunEntry:
         in_band=_number(held.get("in_band")),
         faults=sum(isinstance(each.event, events.Fault) for each in log),
         exit=str(summary.get("exit", "open")),
-        kp_per_s=loop.kp_per_s,
-        ti_s=loop.ti_s,
+        kp_per_s=config.loop.kp_per_s,
+        ti_s=config.loop.ti_s,
         configuration=_hash(folder / "config.toml"),
         size_mb=disk_budget.size_bytes(folder) / 1e6,
         marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
+        geometry=next((e.event.hash for e in reversed(log) if isinstance(e.event, run_events.GeometryInForce)), ""),
         **{name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")},
     )
 

@@ -1,6 +1,5 @@
 """`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time."""
 
-import math
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -10,7 +9,7 @@ from pathlib import Path
 from membrane_ctrl.model import errors, events, states, terminal
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.viewer import blueprints, viewer
-from membrane_ctrl.review.viewer.layer import Layer
+from membrane_ctrl.review.viewer.layer import ALL, Layer
 from membrane_ctrl.run_files.run import Run, open_run
 
 _THIS_MACHINE = "127.0.0.1"
@@ -23,6 +22,8 @@ class ReviewOptions:
     """Options of `review`; see `membrane-ctrl review --help`."""
 
     runs: Sequence[Path]
+    every: bool = False
+    logs: Path = Path("logs")
     at: str | None = None
     around: str | None = None
     start: str | None = None
@@ -40,6 +41,8 @@ class ReviewOptions:
 def review_command(options: ReviewOptions) -> int:
     """Make the review and show it."""
     _require_sense(options)
+    if options.every:
+        return _show_every_run(options)
     runs = [open_run(catalogue.resolve(path)) for path in options.runs]
     with terminal.ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
         if options.live:
@@ -59,19 +62,44 @@ def review_command(options: ReviewOptions) -> int:
 
 def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
     if options.screenshot is not None:
-        try:
-            options.screenshot.write_bytes(viewer.screenshot_of([file], cursor_s))
-        except RuntimeError as error:
-            raise errors.DeviceError(f"no picture: {error}") from None
-        return 0
+        return _picture(options.screenshot, file, cursor_s)
     if options.save is not None:
         print(file)
         return 0
-    return viewer.serve([file], options.bind, options.port) if options.web else viewer.show([file], cursor_s)
+    return viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor_s)
+
+
+def _picture(target: Path, source: Path | str, cursor_s: float | None = None) -> int:
+    try:
+        target.write_bytes(viewer.screenshot_of(source, cursor_s))
+    except RuntimeError as error:
+        raise errors.DeviceError(f"no picture: {error}") from None
+    return 0
+
+
+def _show_every_run(options: ReviewOptions) -> int:
+    from membrane_ctrl.review.viewer.all_runs import RunCatalogue
+
+    found = catalogue.entries(options.logs)
+    if not found:
+        raise errors.InputError(f"{options.logs}: contains no run")
+    with terminal.ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+        served = RunCatalogue(found, Path(folder))
+        print(f"catalogue of {len(found)} runs for Rerun clients: {served.url}", file=sys.stderr)
+        try:
+            if options.screenshot is not None:
+                return _picture(options.screenshot, served.page)
+            if options.web:
+                return viewer.serve(served.page, options.bind, options.port, served.add_timelines)
+            return viewer.show(served.page, meanwhile=served.add_timelines)
+        finally:
+            served.close()
 
 
 def _require_sense(options: ReviewOptions) -> None:
     """Refuse unknown values, and options that would be silently ignored."""
+    if bool(options.runs) == options.every:
+        raise errors.InputError("review: name one run or several, or give --all for all of them")
     if options.tab not in blueprints.TABS:
         raise errors.InputError(f"--tab {options.tab}: known: {', '.join(blueprints.TABS)}")
     if options.align not in {"hold", "start", "utc"}:
@@ -83,6 +111,8 @@ def _require_sense(options: ReviewOptions) -> None:
         raise errors.InputError("--at, --around, --from with --to: only one of these at a time")
     if not options.web and (options.bind != _THIS_MACHINE or options.port):
         raise errors.InputError("--bind and --port: only with --web")
+    if options.every and (options.live or options.save or options.bind != _THIS_MACHINE or any(moments)):
+        raise errors.InputError("--all serves this machine only, and all of each run: omit --bind, --at and the like")
     if not options.live:
         return
     if len(options.runs) != 1:
@@ -129,7 +159,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
     shown = None if span_s is None else (span_s[0] - zeros_s[0], span_s[1] - zeros_s[0])
     maps_um = []
     for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
-        part_s = (-math.inf, math.inf) if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
+        part_s = ALL if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
         maps_um.append(layer.add(run, prefix, zero_s, part_s))
         if prefix:
             print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)

@@ -27,6 +27,7 @@ APPLICATION = "membrane_review"
 # The viewer draws about this many rows of a dozen signals without stutter in software.
 RAW_ROWS_MOST = 400_000
 LEVEL_ROWS_MOST = 50_000
+OVERVIEW_ROWS_MOST = 5_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
 _MAP_PX = 96
@@ -58,10 +59,14 @@ OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
 }
 
 
-class Layer:
-    """Writes runs into one recording, the `.rrd` file `path`."""
+ALL = (-np.inf, np.inf)
 
-    def __init__(self, path: Path, name: str) -> None:
+
+class Layer:
+    """Writes runs into one recording, the `.rrd` file `path`; with `overview_only` coarse levels without ticks."""
+
+    def __init__(self, path: Path, name: str, overview_only: bool = False) -> None:
+        self._overview_only = overview_only
         self._stream = rr.RecordingStream(APPLICATION, recording_id=name)
         self._stream.save(path)
         self._stream.send_recording_name(name)
@@ -79,7 +84,7 @@ class Layer:
         self._stream.flush()
         self._stream.disconnect()
 
-    def add(self, run: Run, prefix: str, zero_s: float, part_s: tuple[float, float]) -> float:
+    def add(self, run: Run, prefix: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL) -> float:
         """Add a run; returns the scale of its maps: their largest change of height, um; NaN without maps.
 
         Parameters
@@ -97,13 +102,15 @@ class Layer:
         self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
         span_s = _end_s(run)
-        level_s = next((w for w in (1.0, 10.0) if span_s / w <= LEVEL_ROWS_MOST), 60.0)
+        rows_most = OVERVIEW_ROWS_MOST if self._overview_only else LEVEL_ROWS_MOST
+        level_s = next((w for w in (1.0, 10.0) if span_s / w <= rows_most), 60.0)
         level = run.level(level_s)
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
         shapes = run.shapes()
         found = find_events(seconds, shapes, run.config.limits.band_um)
         self._overviews(level, run.config.limits.band_um)
-        self._ticks(run, part_s)
+        if not self._overview_only:
+            self._ticks(run, part_s)
         self._lanes(level)
         self._events(run, found, part_s)
         return self._figure(shapes.select(summary.held_at(level, shapes.time_s)), part_s)

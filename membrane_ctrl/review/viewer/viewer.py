@@ -6,10 +6,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeAlias
+from urllib.parse import quote, urlsplit
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
@@ -18,6 +19,9 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import open_plain
 from membrane_ctrl.run_files.rrd_reader import segments
 from membrane_ctrl.run_files.segments import first_message_after
+
+# Work to do while a viewer is open, until the question whether it is still open is answered with no.
+Meanwhile: TypeAlias = Callable[[Callable[[], bool]], None]
 
 # The recorder flushes every second.
 _FOLLOW_S = 0.5
@@ -34,12 +38,20 @@ def viewer_command(*arguments: str) -> list[str]:
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(files: list[Path], at_s: float | None = None) -> int:
-    """Open files on this machine's screen, at a second of `run_time`; return when the window is closed."""
+def show(source: Path | str, at_s: float | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
+    """Open a file or a server's page on this machine's screen; return when the window is closed.
+
+    The cursor is put at a second of `run_time`; `meanwhile` runs while the window is open and ends with it.
+    """
     _require_screen()
     port = free_port()
-    command = viewer_command("--bind", "127.0.0.1", "--port", str(port), *(str(path) for path in files))
-    return _run(command, lambda process: None if at_s is None else put_cursor(process, port, at_s))
+
+    def started(process: subprocess.Popen[bytes]) -> None:
+        if at_s is not None:
+            put_cursor(process, port, at_s)
+        meanwhile(lambda: process.poll() is None)
+
+    return _run(viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started)
 
 
 def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s: float = _CURSOR_S) -> None:
@@ -50,7 +62,7 @@ def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s:
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
         try:
-            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client = ViewerClient.connect(_proxy("127.0.0.1", port))
             client.set_time("run_time", duration=at_s, play_state="paused")
             if any(opened.current_time == round(1e9 * at_s) for opened in client.get_state().recordings):
                 return
@@ -59,8 +71,8 @@ def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s:
         time.sleep(_CURSOR_AGAIN_S)
 
 
-def serve(files: list[Path], bind: str, port: int) -> int:
-    """Serve files to browsers until interrupted.
+def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambda _: None) -> int:
+    """Serve a file, or a page for a server's data, to browsers until interrupted; `meanwhile` as for `show`.
 
     Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1, or
     an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
@@ -68,9 +80,12 @@ def serve(files: list[Path], bind: str, port: int) -> int:
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    _say_where(bind, port, data_port)
+    url = source if isinstance(source, str) else _proxy(_host(bind), data_port)
+    _say_where(bind, port, url)
     options = ["--serve-web", "--bind", bind, "--port", str(data_port), "--web-viewer-port", str(port)]
-    return _run(viewer_command(*options, *(str(path) for path in files)))
+    return _run(
+        viewer_command(*options, str(source)), lambda process: meanwhile(lambda: process.poll() is None)
+    )  # fmt: skip
 
 
 def live(folder: Path, web: bool, port: int = 0) -> int:
@@ -82,10 +97,10 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     data_port, port = free_port(), port or free_port()
     kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
     server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port), "-")
-    proxy = f"rerun+http://127.0.0.1:{data_port}/proxy"
+    proxy = _proxy("127.0.0.1", data_port)
     if web:
         _require_listening("127.0.0.1", port)
-        _say_where("127.0.0.1", port, data_port)
+        _say_where("127.0.0.1", port, proxy)
     else:
         _require_screen()
     try:
@@ -111,12 +126,19 @@ def _require_screen() -> None:
         raise errors.DeviceError("no screen: use --web and open the address in a browser, or --screenshot FILE")
 
 
-def _say_where(bind: str, port: int, data_port: int) -> None:
-    """Print the page's address, and how to reach it from another machine."""
-    host = "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
-    page = f"http://{host}:{port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{data_port}%2Fproxy"
-    print(f"open {page}", file=sys.stderr)
+def _host(bind: str) -> str:
+    return "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
+
+
+def _proxy(host: str, port: int) -> str:
+    return f"rerun+http://{host}:{port}/proxy"
+
+
+def _say_where(bind: str, port: int, url: str) -> None:
+    """Print the address of the page that shows a server's data, and how to reach it from another machine."""
+    print(f"open http://{_host(bind)}:{port}/?url={quote(url, safe='')}", file=sys.stderr)
     if bind == "127.0.0.1":
+        data_port = urlsplit(url).port
         tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
         print(f"from another machine first: {tunnel}", file=sys.stderr)
 
@@ -231,11 +253,16 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
         return _at_rest(viewer)
 
 
-def screenshot_of(files: Sequence[Path], at_s: float | None = None) -> bytes:
-    """PNG of recordings as they open, at a second of `run_time` or their end. Raises RuntimeError as `screenshot`."""
+def screenshot_of(source: Path | str, at_s: float | None = None) -> bytes:
+    """PNG of a recording as it opens, at a second of `run_time` or its end, or of a server's page.
+
+    Raises RuntimeError as `screenshot`.
+    """
     with _headless() as viewer:
-        viewer.open([str(path.resolve()) for path in files])
-        if at_s is None:
+        viewer.open(source if isinstance(source, str) else str(source.resolve()))
+        if isinstance(source, str):
+            pass
+        elif at_s is None:
             viewer.set_time("run_time", play_state="following")
         else:
             viewer.set_time("run_time", duration=at_s, play_state="paused")
@@ -285,7 +312,7 @@ def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
     until_s = time.monotonic() + _WAIT_S
     while time.monotonic() < until_s and process.poll() is None:
         try:
-            viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            viewer = ViewerClient.connect(_proxy("127.0.0.1", port))
             viewer.take_screenshot(max_size=16)
         except (RuntimeError, ConnectionError):
             time.sleep(_BETWEEN_S)
