@@ -1,12 +1,17 @@
 """What a person decides: which candidate is applied, and whether kept gains become those of the configuration."""
 
+import difflib
 import sys
+import tomllib
+from pathlib import Path
 
-from membrane_ctrl.model import terminal
+from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.controller.cross_check import require_sound
+from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions.folder import SessionFolder
+from membrane_ctrl.sessions.folder import SessionFolder, open_session
 from membrane_ctrl.sessions.live_hold import Progress
-from tuning import session
+from tuning import gains_file, session
 from tuning.proposal import design, trade
 from tuning.rig import HoldRig
 
@@ -43,3 +48,105 @@ def chosen(folder: SessionFolder, rig: HoldRig, yes: bool, name: str, progress: 
             progress.say(str(error))
     rig.catch_up()
     return True
+
+
+# Kept gains into the configuration, so that the next hold starts with them.
+
+GAIN_KEYS = (
+    "kp_per_s",
+    "ti_s",
+    "td_s",
+    "measurement_filter_s",
+    "barometer_gain_um_per_pa",
+    "temperature_gain_um_per_k",
+)
+_ANY = ("setpoint_um", "bleed_fraction")  # settings of a loop on which its gains do not depend
+
+
+def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> int:
+    """Save a session's kept gains, by default those kept last, into a configuration file; returns the exit code.
+
+    Shows the difference and asks; without a terminal only `yes` writes. Comments stay.
+
+    Raises InputError if the gains were not kept, or are not for this configuration.
+    """
+    folder = open_session(logs / "tuning" / gains_file.to_roll_back(logs).session if name is None else name)
+    gains = _kept(folder)
+    config = toml_file.load(path, schema.Config)
+    _require_same_bench(path, config, folder)
+    before = files.read_text(path, follow=True)
+    changed = {key: getattr(gains, key) for key in GAIN_KEYS if getattr(gains, key) != getattr(config.loop, key)}
+    after = _with(before, changed, path)
+    loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed)
+    require_sound(config.model_copy(update={"loop": loop}), str(path))
+    if not changed:
+        print(f"{path} already has the gains of {folder.path.name}")
+        return errors.Exit.DONE
+    shown = difflib.unified_diff(
+        before.splitlines(), after.splitlines(), str(path), folder.path.name, lineterm="", n=1
+    )
+    print("\n".join(shown))
+    if not yes and not (sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")):
+        print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
+        return errors.Exit.DONE
+    _replace(path, before, after)
+    told = gains_file.entry("saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains)
+    gains_file.note(folder.path.resolve().parents[1], told)
+    return errors.Exit.DONE
+
+
+def _kept(folder: SessionFolder) -> schema.LoopConfig:
+    """The gains that the session verified and kept. Raises InputError if there are none, or they were rolled back."""
+    done = session.verified_of(folder)
+    if not done.kept:
+        raise InputError(f"{folder.path}: its gains were not kept: {done.reason}")
+    last = [line for line in gains_file.entries(folder.path.resolve().parents[1]) if line.session == folder.path.name]
+    if last and last[-1].what == "rolled_back":
+        raise InputError(f"{folder.path}: its gains were rolled back on {last[-1].time_utc} ({last[-1].reason})")
+    return done.after
+
+
+def _require_same_bench(path: Path, config: schema.Config, folder: SessionFolder) -> None:
+    """Raises InputError if the gains are for another pump, another loop, or the simulated bench."""
+    tuned = folder.config
+    if config.devices is not None and (tuned.devices is None or folder.head.source == "twin"):
+        raise InputError(f"{path}: has [devices], but the session tuned the simulated bench")
+    for section in ("pump", "loop"):
+        here, there = getattr(config, section), getattr(tuned, section)
+        for key in type(here).model_fields:
+            now, then = getattr(here, key), getattr(there, key)
+            if now != then and not (section == "loop" and key in (*GAIN_KEYS, *_ANY)):
+                raise InputError(
+                    f"{path}: {section}.{key} = {now}, the session had {then}: its gains do not fit; tune with this "
+                    "configuration"
+                )
+
+
+def _with(text: str, changed: dict[str, float], path: Path) -> str:
+    """The configuration's text with these keys of `[loop]`; nothing else changes, or InputError is raised."""
+    import tomlkit
+    from tomlkit.exceptions import TOMLKitError
+
+    wanted = tomllib.loads(text)
+    wanted["loop"] = wanted.get("loop", {}) | changed
+    try:
+        document = tomlkit.parse(text)
+        document.setdefault("loop", tomlkit.table()).update(changed)
+        edited = tomlkit.dumps(document)
+        if tomllib.loads(edited) == wanted:
+            return edited
+    except (TOMLKitError, ValueError):
+        pass
+    lines = ", ".join(f"{key} = {value:g}" for key, value in changed.items())
+    raise InputError(f"{path}: cannot be edited by a program; set in [loop]: {lines}")
+
+
+def _replace(path: Path, before: str, after: str) -> None:
+    """Write the file a link leads to, with its permissions. Raises InputError also if it has changed meanwhile."""
+    target = path.resolve()
+    with errors.writing(path):
+        mode = target.stat().st_mode
+        if files.read_text(target) != before:
+            raise InputError(f"{path}: has changed meanwhile; repeat `tune save`")
+        files.write_text_atomic(target, after)
+        target.chmod(mode)

@@ -129,6 +129,20 @@ def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
 
 
 @app.command()
+def save(
+    config: Annotated[Path, typer.Option("--config", help="Configuration to save them to, one TOML file.")],
+    session: Annotated[Path | None, typer.Argument(metavar="SESSION", help="By default the one kept last.")] = None,
+    logs: LogsOption = Path("logs"),
+    author: AuthorOption = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Save without asking.")] = False,
+) -> int:
+    """Save the kept gains of a session into a configuration, so that the next hold starts with them."""
+    from tuning import choice, command
+
+    return choice.save(config, session, logs, author or command.author_name(), yes)
+
+
+@app.command()
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Session folder.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Session folder.")],

@@ -177,6 +177,8 @@ def rollback(options: TuneOptions) -> int:
     progress.say(
         f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti {kept.before.ti_s:g} s"
     )
+    for saved in {line.reason for line in gains_file.entries(options.logs) if line.what == "saved"}:
+        progress.say(f"{saved} was saved with gains of a session: check its [loop]")
     return Exit.DONE
 
 
@@ -251,7 +253,8 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             return f"{session.traded(folder).candidate} is on trial: {_gains_words(loop)}"
         case "verify":
             done = session.verified_of(folder)
-            return "kept" if done.kept else f"the previous gains are back: {done.reason}"
+            kept = "kept until the hold ends; `membrane-ctrl tune save --config FILE` saves them for the next one"
+            return kept if done.kept else f"the previous gains are back: {done.reason}"
         case _:
             return "done"
 

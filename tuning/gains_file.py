@@ -106,7 +106,7 @@ def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
 # `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.
 
 _FILE = "journal.jsonl"
-What = Literal["kept", "taken_back", "rolled_back"]
+What = Literal["kept", "taken_back", "rolled_back", "saved"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class GainsEntry:
     """One line of the journal."""
 
     time_utc: str
-    what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back": by a person
+    what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back", "saved": by a person
     session: str
     author: str
     reason: str
@@ -191,7 +191,7 @@ def to_roll_back(logs: Path) -> GainsEntry:
             undone.add(found.session)
         elif found.what == "kept" and found.session not in undone:
             return found
-    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains to roll back")
+    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
 
 
 def history_table(found: list[GainsEntry]) -> str:

@@ -1,0 +1,211 @@
+"""`tune save`: a configuration with a session's kept gains, its comments, and nothing else changed."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.sessions import folder as plain
+from tuning import choice
+from tuning.gains_file import entries, entry, note
+from tuning.session import Verified
+
+BEFORE = LoopConfig()
+GAINS = {"kp_per_s": 0.448, "ti_s": 8.79, "measurement_filter_s": 0.1, "temperature_gain_um_per_k": 121.5}
+AFTER = LoopConfig.model_validate(BEFORE.model_dump() | GAINS)
+TEXT = """# The bench in room 3.
+[limits]
+band_um = 2.0     # agreed with optics
+
+[loop]            # tuned in May
+kp_per_s = 0.61   # 1/s
+ti_s     = 6.5
+setpoint_um = 5.0
+# bleed: none
+
+[shape]
+enabled = false
+"""
+
+
+def kept_session(logs: Path, kept: bool = True, config: Config | None = None) -> Path:
+    """A session that verified `AFTER`, and its line in the journal."""
+    session = plain.create_session(logs, "s1", "eve", "a-run", config or Config(), BEFORE)
+    reason = "" if kept else "the readings show a sensitivity of 2.3"
+    plain.write(session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER))
+    note(logs, entry("kept" if kept else "taken_back", session.path.name, "eve", "why", BEFORE, AFTER))
+    return session.path
+
+
+def saved(path: Path, *words: str, text: str = TEXT) -> int:
+    path.write_text(text)
+    return run(["tune", "save", "--config", str(path), "--logs", str(path.parent / "logs"), *words])
+
+
+def test_the_next_hold_starts_with_the_kept_gains_and_comments_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, path = kept_session(tmp_path / "logs"), tmp_path / "lab.toml"
+    path.touch(0o600)
+    assert saved(path, "--yes") == Exit.DONE
+    assert load(path, Config).loop == AFTER.model_copy(update={"setpoint_um": 5.0})
+    assert tomllib.loads(path.read_text()) == tomllib.loads(TEXT) | {"loop": {"setpoint_um": 5.0, **GAINS}}
+    lines = path.read_text().splitlines()
+    assert "kp_per_s = 0.448   # 1/s" in lines
+    assert [line for line in TEXT.splitlines() if line not in lines] == ["kp_per_s = 0.61   # 1/s", "ti_s     = 6.5"]
+    said = capsys.readouterr().out.splitlines()
+    assert "-kp_per_s = 0.61   # 1/s" in said
+    assert "+kp_per_s = 0.448   # 1/s" in said
+    assert path.stat().st_mode & 0o777 == 0o600
+    last = entries(tmp_path / "logs")[-1]
+    assert (last.what, last.session, last.reason) == ("saved", session.name, str(path))
+    assert run(["tune", "save", "--config", str(path), str(session)]) == Exit.DONE
+    assert "already has the gains" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[loop]\n",
+        "loop.kp_per_s = 0.5\nshape.enabled = false\n",
+        "loop = { kp_per_s = 0.5, ti_s = 7.0 } # inline\n[shape]\nenabled = false\n",
+        TEXT.replace("\n", "\r\n"),
+        "[loop]\nti_s = 9\n[shape]\nenabled = false\n",
+    ],
+)
+def test_every_way_to_write_a_table_is_kept(tmp_path: Path, text: str) -> None:
+    kept_session(tmp_path / "logs")
+    path = tmp_path / "lab.toml"
+    assert saved(path, "--yes", text=text) == Exit.DONE
+    found, before = tomllib.loads(path.read_bytes().decode()), tomllib.loads(text)
+    assert found == before | {"loop": before.get("loop", {}) | GAINS}
+    assert path.read_bytes().count(b"#") == text.count("#")
+
+
+class Terminal:
+    """A terminal at which one answer is typed."""
+
+    def __init__(self, answer: str) -> None:
+        self._answer = answer
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self) -> str:
+        if self._answer == "!":
+            raise KeyboardInterrupt
+        return self._answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "changed", "code"),
+    [
+        ("y\n", True, Exit.DONE),
+        ("\n", False, Exit.DONE),
+        ("", False, Exit.DONE),
+        ("!", False, Exit.INTERRUPTED),
+        (None, False, Exit.DONE),
+    ],
+)
+def test_only_a_yes_writes(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answer: str | None,
+    changed: bool,
+    code: Exit,
+) -> None:
+    kept_session(tmp_path / "logs")
+    path = tmp_path / "lab.toml"
+    if answer is not None:
+        monkeypatch.setattr("sys.stdin", Terminal(answer))
+    assert saved(path) == code
+    assert (path.read_text() != TEXT) == changed
+    assert "+kp_per_s = 0.448   # 1/s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (TEXT + "[pump]\nflow_full_um_per_s = 8.0\n", "pump.flow_full_um_per_s = 8.0, the session had 5.3"),
+        (TEXT.replace("setpoint", "rate_hz = 25.0\nsetpoint"), "loop.rate_hz = 25.0, the session had 50.0"),
+        (TEXT + '[devices]\nboard = "tcp://192.0.2.1"\n', "the session tuned the simulated bench"),
+        (TEXT.replace("band_um = 2.0 ", "band_um = 900.0 "), "limits.band_um = 900"),
+        (TEXT.replace("[loop]", "[lop]"), "unknown key"),
+        (TEXT.replace("[loop]", "[loop"), "not valid TOML"),
+    ],
+)
+def test_gains_for_another_bench_are_not_saved(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, reason: str
+) -> None:
+    kept_session(tmp_path / "logs")
+    path = tmp_path / "lab.toml"
+    assert saved(path, "--yes", text=text) == Exit.BAD_INPUT
+    assert path.read_text() == text
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")]
+    assert any("lab.toml" in line and reason in line for line in said), said
+
+
+def test_gains_that_were_not_kept_or_were_rolled_back_are_not_saved(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs, path = tmp_path / "logs", tmp_path / "lab.toml"
+    assert saved(path, "--yes") == Exit.BAD_INPUT
+    assert "no kept gains" in capsys.readouterr().err
+    failed = kept_session(logs, kept=False)
+    assert saved(path, str(failed), "--yes") == Exit.BAD_INPUT
+    assert "its gains were not kept: the readings show" in capsys.readouterr().err
+    undone = kept_session(logs)
+    note(logs, entry("rolled_back", undone.name, "ann", "too slow", BEFORE, AFTER))
+    assert saved(path, str(undone), "--yes") == Exit.BAD_INPUT
+    assert "(too slow)" in capsys.readouterr().err
+    unfinished = plain.create_session(logs, "s2", "eve", "a-run", Config(), BEFORE).path
+    assert saved(path, str(unfinished), "--yes") == Exit.BAD_INPUT
+    assert "run `membrane-ctrl tune verify` first" in capsys.readouterr().err
+    assert path.read_text() == TEXT
+
+
+def test_a_file_that_changes_during_the_question_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept_session(tmp_path / "logs")
+    path = tmp_path / "lab.toml"
+
+    class Slow(Terminal):
+        def readline(self) -> str:
+            path.write_text(TEXT + "# edited\n")
+            return "y\n"
+
+    monkeypatch.setattr("sys.stdin", Slow(""))
+    assert saved(path) == Exit.BAD_INPUT
+    assert "has changed meanwhile" in capsys.readouterr().err
+    assert path.read_text() == TEXT + "# edited\n"
+
+
+def test_a_link_leads_to_the_file_that_is_written(tmp_path: Path) -> None:
+    kept_session(tmp_path / "logs")
+    path, target = tmp_path / "lab.toml", tmp_path / "etc" / "real.toml"
+    target.parent.mkdir()
+    target.write_text(TEXT)
+    path.symlink_to(target)
+    assert saved(path, "--yes") == Exit.DONE
+    assert path.is_symlink()
+    assert load(target, Config).loop.kp_per_s == 0.448
+
+
+def test_what_cannot_be_edited_says_what_to_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An editor that would change anything else is not trusted."""
+    monkeypatch.setattr("tomlkit.dumps", lambda document: TEXT.replace("2.0", "3.0"))
+    kept_session(tmp_path / "logs")
+    assert saved(tmp_path / "lab.toml", "--yes") == Exit.BAD_INPUT
+    assert "set in [loop]: kp_per_s = 0.448, ti_s = 8.79" in capsys.readouterr().err
+    assert set(choice.GAIN_KEYS) <= set(LoopConfig.model_fields)
