@@ -32,7 +32,6 @@ FLOORS = {
     3: {"membrane_ctrl/control", "membrane_ctrl/instruments", "membrane_ctrl/metrology", "membrane_ctrl/processes"},
     4: {
         "membrane_ctrl/alarms",
-        "membrane_ctrl/console",
         "membrane_ctrl/controller",
         "membrane_ctrl/geometry",
         "membrane_ctrl/sim",
@@ -40,6 +39,7 @@ FLOORS = {
     5: {"membrane_ctrl/control_port", "membrane_ctrl/measure", "membrane_ctrl/run_files"},
     6: {
         "membrane_ctrl/acquisition",
+        "membrane_ctrl/console",
         "membrane_ctrl/recorder",
         "membrane_ctrl/sessions",
     },

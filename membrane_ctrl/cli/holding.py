@@ -8,7 +8,7 @@ import typer
 from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import clock, errors
+from membrane_ctrl.model import clock, errors, terminal
 
 alarm_app = typer.Typer(no_args_is_help=True)
 
@@ -46,13 +46,16 @@ def hold(
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop."""
+    settings = _started(_with_devices(config, devices, twin), from_flat)
+    duration_s = None if duration is None else clock.parse_duration_s(duration)
+    terminal.progress("loading the control program")
     from membrane_ctrl.hold.start import HoldOptions, hold_mirror
 
     options = HoldOptions(
-        config=_started(_with_devices(config, devices, twin), from_flat),
+        config=settings,
         source=str(config or devices or "the defaults"),
         twin=twin,
-        duration_s=None if duration is None else clock.parse_duration_s(duration),
+        duration_s=duration_s,
         name=name,
         logs_dir=logs,
         clear_faults=clear_faults,

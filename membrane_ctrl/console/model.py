@@ -6,18 +6,21 @@ from dataclasses import dataclass
 from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import duration, why
+from membrane_ctrl.console.why import duration, go_on, is_paused, number, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import events, run_events, run_status, shape_estimate, states, telemetry
 
 MINUTE_S = 60
+TREND_S = 240  # the widest terminal shows this much
+_EVENTS_KEPT = 60
+_NOT_LISTED = events.Why | run_events.Alive  # the headline shows the first
 
 
 class Trend:
-    """The last minute of a signal, by whole seconds of the run's clock."""
+    """The last minutes of a signal, by whole seconds of the run's clock."""
 
     def __init__(self) -> None:
-        self._seconds: deque[tuple[int, list[float]]] = deque(maxlen=MINUTE_S)
+        self._seconds: deque[tuple[int, list[float]]] = deque(maxlen=TREND_S)
 
     def add(self, mono_s: float, value: float) -> None:
         """Add a value; NaN leaves a gap."""
@@ -28,12 +31,12 @@ class Trend:
             self._seconds[-1][1].append(value)
 
     def means(self) -> tuple[float, ...]:
-        """Mean of each of the last 60 s, oldest first; NaN for a gap."""
+        """Mean of each of the last `TREND_S` seconds, oldest first; NaN for a gap."""
         if not self._seconds:
-            return (math.nan,) * MINUTE_S
+            return (math.nan,) * TREND_S
         newest = self._seconds[-1][0]
         known = {second: math.fsum(values) / len(values) for second, values in self._seconds if values}
-        return tuple(known.get(second, math.nan) for second in range(newest - MINUTE_S + 1, newest + 1))
+        return tuple(known.get(second, math.nan) for second in range(newest - TREND_S + 1, newest + 1))
 
     def values(self) -> list[float]:
         """Every finite value of the last minute, oldest first."""
@@ -68,12 +71,14 @@ class ConsoleView:
 
     row: telemetry.TelemetryRow | None  # the newest tick; None before the first
     why: str  # the answer in one line
+    go_on: str  # how to go on, if that takes a person
+    paused: bool
     silent_s: float  # age of the row if it deserves a warning, else 0
     state: states.State
     state_age_s: float
     elapsed_s: float
     left_s: float  # from the first tick; infinite for a run without an end
-    trend_um: tuple[float, ...]  # mean error of each of the last 60 s
+    trend_um: tuple[float, ...]  # mean error of each of the last `TREND_S` seconds
     error_mean_um: float  # of the last minute's error samples, as the next two
     error_std_um: float
     in_band_fraction: float
@@ -85,13 +90,20 @@ class ConsoleView:
     too_tight: bool  # the leak is too small for the band
     gains: str  # in force, with the countdown of a trial
     recording: str  # what prevents recording; empty if nothing does
+    events: tuple[events.EventLine, ...]  # the last ones, oldest first
     shape: ShapeView
 
 
 class ConsoleModel:
-    """Remembers the rows, events and shapes that the console shows."""
+    """Remembers the rows, events and shapes that the console shows.
 
-    def __init__(self, config: Config, duration_s: float | None = None) -> None:
+    `ctl` is the beginning of a command for this run, as a person types it; `keys`: the console has keys.
+    """
+
+    def __init__(
+        self, config: Config, duration_s: float | None = None, ctl: str = "membrane-ctrl ctl", keys: bool = False
+    ) -> None:
+        self._ctl, self._keys = ctl, keys
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
         self._status = run_status.RunStatus()
@@ -102,6 +114,7 @@ class ConsoleModel:
         self._reference: shape_estimate.ShapeEstimate | None = None
         self._cycles = 0
         self._rejected = 0
+        self._events: deque[events.EventLine] = deque(maxlen=_EVENTS_KEPT)
 
     @property
     def ended(self) -> bool:
@@ -118,7 +131,10 @@ class ConsoleModel:
 
     def take_event(self, line: events.EventLine) -> None:
         """Take one event, a line of `events.jsonl`."""
-        self._status = self._status.after_event(run_events.from_dict(line), line.get("mono_s", math.nan))
+        event = run_events.from_dict(line)
+        self._status = self._status.after_event(event, line.get("mono_s", math.nan))
+        if not isinstance(event, _NOT_LISTED):
+            self._events.append(line)
 
     def take_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take one measurement cycle."""
@@ -140,6 +156,8 @@ class ConsoleModel:
         return ConsoleView(
             row=row,
             why=self._why(),
+            go_on=go_on(row, status.why, self._ctl, self._keys) if row else "",
+            paused=row is not None and is_paused(row, status.why),
             silent_s=age_s if age_s > SILENT_S else 0.0,
             state=states.State(int(row.state)) if row else states.State.STANDBY,
             state_age_s=max(0.0, now_s - self._status.since_s),
@@ -157,6 +175,7 @@ class ConsoleModel:
             too_tight=self._too_tight(now_s),
             gains=run_status.gains_words(status.loop or self._config.loop.model_dump(), status.trial_left_s),
             recording=status.recording_words,
+            events=tuple(self._events),
             shape=self._shape(now_s),
         )
 
@@ -204,3 +223,20 @@ def text(line: events.EventLine) -> str:
     reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")
     seen = f" ({line['seen']})" if line.get("seen") else ""
     return ": ".join(words for words in (name, reason) if words) + seen
+
+
+def event_words(event: events.EventLine) -> str:
+    """Format an event as one line, without its time."""
+    what = " ".join(str(event[key]) for key in ("state", "child", "exit", "command") if event.get(key) is not None)
+    words = " ".join(f"{what} {text(event)}".split())  # one line, even for multi-line errors
+    more = "".join(
+        f"{link}{event[key]}"
+        for link, key in (("; ", "remedy"), (": ", "text"), (", by ", "who"), ("; refused: ", "refused"))
+        if event.get(key)
+    )
+    return f"{str(event.get('kind', '?')).upper()} {words}{more}".rstrip()
+
+
+def event_line(event: events.EventLine) -> str:
+    """Format an event as one line of a log."""
+    return f"{number(event.get('mono_s', math.nan), 1):>9} s  {event_words(event)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,12 +17,13 @@ from rich.console import Console
 from rich.live import Live
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console import model, why
-from membrane_ctrl.console.view import console_panel
+from membrane_ctrl.console import keys, model, why
+from membrane_ctrl.console.view import ConsolePage
+from membrane_ctrl.control_port.sockets import SOCKET_NAME
 from membrane_ctrl.model import events, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.model.terminal import Plain
+from membrane_ctrl.model.terminal import Plain, in_foreground
 from membrane_ctrl.processes import child, ring
 
 # For a log file: one line per second, and these at once
@@ -49,6 +51,8 @@ def line(view: model.ConsoleView) -> str:
         f"late {why.number(row.lateness_ms, 1)} ms",
         view.why,
     ]
+    if view.go_on:
+        parts.append(view.go_on)
     if view.recording:
         parts.append(f"RECORDING {view.recording}")
     if math.isfinite(view.left_s):
@@ -64,15 +68,6 @@ def at_once(line: events.EventLine) -> bool:
     return isinstance(event, _AT_ONCE)
 
 
-def event_line(event: events.EventLine) -> str:
-    """Format an event as one line."""
-    mono_s = event.get("mono_s", math.nan)
-    what = " ".join(str(event[key]) for key in ("state", "child", "exit") if key in event)
-    words = " ".join(f"{what} {model.text(event)}".split())  # one line, even for multi-line errors
-    remedy = f"; {event['remedy']}" if event.get("remedy") else ""
-    return f"{why.number(mono_s, 1):>9} s  {str(event.get('kind', '?')).upper()} {words}{remedy}".rstrip()
-
-
 def _shape_words(view: model.ConsoleView) -> str:
     shape = view.shape
     if shape.estimate is None:
@@ -80,6 +75,7 @@ def _shape_words(view: model.ConsoleView) -> str:
     return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.duration(shape.age_s)}"
 
 
+_SOCKET = Path("logs", SOCKET_NAME)  # where `ctl` looks
 _LOOK_S = 0.2  # as fast as people read changing figures
 _PLAIN_S = 1.0
 # A round takes some ms; a stopped terminal (Ctrl-S, a dead ssh) buffers writes for a while
@@ -97,6 +93,8 @@ class ConsoleSpec:
     run_dir: Path  # run folder, shown to the operator
     config: Config
     duration_s: float | None = None
+    socket: Path | None = None  # of the control port; None if it is off
+    keyboard: keys.Keyboard | None = None  # None unless stdin is the terminal that the console draws on
     since_s: float = -math.inf  # an earlier console has shown the events before
 
 
@@ -106,6 +104,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     Target of a `spawn`ed process; reports over `status` that it is alive. Always restores the terminal.
     """
     child.leave_at_stop()
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # it may restore a terminal that has passed to the shell
     report = child.reporter(status)
     with closing(_Feed(spec)) as feed:
 
@@ -129,8 +128,10 @@ def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]
         rounds(show)
 
 
-def give_back_terminal() -> None:
-    """Restore the terminal's main page and cursor after a killed console."""
+def give_back_terminal(keyboard: keys.Keyboard | None = None) -> None:
+    """Restore the terminal's main page, cursor and modes after a killed console."""
+    if keyboard is not None:
+        keyboard.restore()
     with suppress(OSError):
         terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # these control bytes are intended
         if terminal.isatty():
@@ -142,7 +143,8 @@ class _Feed:
     """Feeds the rings into the model."""
 
     def __init__(self, spec: ConsoleSpec) -> None:
-        self.model = model.ConsoleModel(spec.config, spec.duration_s)
+        ctl = "membrane-ctrl ctl" + ("" if spec.socket in (None, _SOCKET) else f" --socket {spec.socket}")
+        self.model = model.ConsoleModel(spec.config, spec.duration_s, ctl, spec.keyboard is not None)
         self._telemetry = ring.RingReader(spec.telemetry)
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
@@ -166,16 +168,45 @@ class _Feed:
 
 @contextmanager
 def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """Show the console on the terminal's alternate page; restore the main page afterwards."""
-    run = str(spec.run_dir)
+    """Show the console on the terminal's alternate page while in the foreground; restore the main page afterwards."""
+    run, handle = str(spec.run_dir), 2
+    live = Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
+    with _keys(spec) as (reader, desk):
 
-    def show() -> None:
-        feed.update()
-        live.update(Plain(console_panel(feed.model.view(spec.clock.now()), spec.config, run)), refresh=True)
+        def show() -> None:
+            feed.update()
+            if not in_foreground(handle):
+                live.stop()
+                return
+            view = feed.model.view(spec.clock.now())
+            if reader is None:
+                page = ConsolePage(view, spec.config, run)
+            else:
+                desk.typed(reader.read(), view.paused)
+                page = ConsolePage(view, spec.config, run, desk.foot, desk.asks, desk.help)
+            live.start()
+            live.update(Plain(page), refresh=True)
 
-    with Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False) as live:
-        yield show
+        try:
+            yield show
+        finally:
+            live.stop()
     print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # a last line that remains
+
+
+@contextmanager
+def _keys(spec: ConsoleSpec) -> Iterator[tuple[keys.KeyReader | None, keys.Desk]]:
+    """The keyboard, if there is one and the control port takes what it asks for."""
+    desk = keys.Desk(keys.sender(spec.socket or _SOCKET, spec.run_dir.name))
+    reader = None
+    if spec.keyboard is not None and spec.socket is not None:
+        with suppress(OSError):  # the terminal belongs to another user: `su`
+            reader = keys.KeyReader(spec.keyboard)
+    try:
+        yield reader, desk
+    finally:
+        if reader is not None:
+            reader.close()
 
 
 @contextmanager
@@ -186,7 +217,7 @@ def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
     def show() -> None:
         nonlocal due_s
         lines = [
-            event_line(event)
+            model.event_line(event)
             for event in feed.update()
             if at_once(event) and event.get("mono_s", math.inf) >= spec.since_s
         ]

@@ -1,16 +1,17 @@
-"""The console on a terminal. It fits 80 x 24; a wider terminal gets longer lines, not more items."""
+"""The console on a terminal, from 60 x 15 characters: a higher one gets more items, a wider one a longer trend."""
 
 import math
 from collections.abc import Sequence
 
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.panel import Panel
 from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleView, ShapeView
+from membrane_ctrl.console.keys import HELP
+from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
 from membrane_ctrl.console.why import NONE, duration, number, percent
 from membrane_ctrl.model import states, telemetry
 
@@ -23,28 +24,27 @@ def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
     return Text("█" * filled, style=style) + Text("░" * (width - filled), style="dim")
 
 
-def signed_bars(values: Sequence[float], full: float, band: float) -> tuple[Text, Text]:
-    """Draw a history as bars above (upper line) and below (lower line) a common zero.
+def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1) -> list[Text]:
+    """Draw a history as bars above and below a common zero: `rows` lines for either side, from the top.
 
     `full` is the value of a full-height bar; bars beyond `band` are red, the others green. NaN is a gap, zero the
     thinnest upward bar.
     """
-    upper, lower = Text(), Text()
+    lines = [Text() for _ in range(2 * rows)]
     for value in values:
-        if not math.isfinite(value):
-            upper.append(" ")
-            lower.append(" ")
-            continue
         colour = "green" if abs(value) <= band else "red"
-        eighths = min(8, max(1, math.ceil(8 * abs(value) / full)))
-        if value >= 0:
-            upper.append(_EIGHTHS[eighths], colour)
-            lower.append(" ")
-        else:
-            upper.append(" ")
-            # there are no hanging block characters: draw the rest of the cell in the background colour
-            lower.append(_EIGHTHS[8 - eighths], Style(color=colour, reverse=True))
-    return upper, lower
+        eighths = min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full))) if math.isfinite(value) else 0
+        for row, line in enumerate(lines):
+            up = row < rows
+            in_row = min(8, max(0, eighths - 8 * (rows - 1 - row if up else row - rows)))
+            if not in_row or up != (value >= 0):
+                line.append(" ")
+            elif up:
+                line.append(_EIGHTHS[in_row], colour)
+            else:
+                # there are no hanging block characters: draw the rest of the cell in the background colour
+                line.append(_EIGHTHS[8 - in_row], Style(color=colour, reverse=True))
+    return lines
 
 
 def full_scale(values: Sequence[float], least: float) -> float:
@@ -67,19 +67,97 @@ _BAR_WIDTH = 10
 _CALM = 0.25  # of the band: on a finer scale noise would look like trouble
 
 
-def console_panel(view: ConsoleView, config: Config, run: str) -> Panel:
-    """The whole console; `run` is the run folder."""
-    time_left = f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
-    title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
-    title.append(f" for {duration(view.state_age_s)} ")
-    return Panel(
-        Group(_headline(view, config), Text(), _figures(view, config)),
-        title=title,
-        title_align="left",
-        subtitle=Text(f" run {duration(view.elapsed_s)}, {time_left} · {run} ", style="dim", overflow="ellipsis"),
-        subtitle_align="left",
-        border_style="red" if view.fault or view.silent_s else "green" if view.state == states.State.HOLD else "blue",
-    )
+_LABELS = 8  # characters
+_EDGES = 5 + _LABELS  # borders, padding and labels beside a trend
+_BAR_ROWS_MAX = 6
+_EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
+_EVENT_STYLES = {"fault": "bold red", "cleared": "green", "state": "bold", "command": "cyan", "refused": "yellow"}
+
+
+class ConsolePage:
+    """The whole console in the height there is.
+
+    Parameters
+    ----------
+    view : ConsoleView
+    config : Config
+    run : str
+        The run folder.
+    foot : str
+        The last line: keys, their answers, or a question; empty without a keyboard.
+    asks : bool
+        The last line is a question.
+    help_ : bool
+        Explain the keys instead of listing events.
+    """
+
+    def __init__(
+        self, view: ConsoleView, config: Config, run: str, foot: str = "", asks: bool = False, help_: bool = False
+    ) -> None:
+        self._view, self._config, self._run = view, config, run
+        self._foot, self._asks, self._help = foot, asks, help_
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        height = options.height or console.height
+        trend_s = options.max_width - _EDGES
+
+        def spare(omitted: int) -> int:
+            panel = self._panel(trend_s, _DISPENSABLE[:omitted], rows=1, below=0)
+            return height - len(console.render_lines(panel, options.update(height=None)))
+
+        needed = len(HELP) + 1 if self._help else 0
+        omitted, below = next(
+            ((n, left) for n in range(len(_DISPENSABLE)) if (left := spare(n)) >= needed),
+            (len(_DISPENSABLE), max(0, spare(len(_DISPENSABLE)))),
+        )
+        rows = 1 if self._help else 1 + max(0, min(_BAR_ROWS_MAX - 1, (below - _EVENTS_MIN) // 6))
+        yield self._panel(trend_s, _DISPENSABLE[:omitted], rows, below - 2 * (rows - 1))
+
+    def _panel(self, trend_s: int, omitted: Sequence[str], rows: int, below: int) -> Panel:
+        """The console without some items, `rows` lines on either side of the trend's zero, and `below` more."""
+        view = self._view
+        time_left = f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
+        title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
+        title.append(f" for {duration(view.state_age_s)} ")
+        trend = () if "trend" in omitted else _trend(view, self._config, trend_s, rows)
+        figures = _figures(view, self._config, trend, omitted)
+        parts: list[RenderableType] = [_headline(view, self._config), *([] if "" in omitted else [Text()]), figures]
+        parts += _help(below) if self._help else _events(view, below)
+        if self._foot:
+            style = "bold yellow" if self._asks else "dim"
+            parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
+        held = view.state == states.State.HOLD
+        return Panel(
+            Group(*parts),
+            title=title,
+            title_align="left",
+            subtitle=Text(
+                f" run {duration(view.elapsed_s)}, {time_left} · {self._run} ", style="dim", overflow="ellipsis"
+            ),
+            subtitle_align="left",
+            border_style="red" if view.fault or view.silent_s else "green" if held else "blue",
+        )
+
+
+def _events(view: ConsoleView, lines: int) -> list[RenderableType]:
+    """The last events in so many lines, the newest at the bottom."""
+    if lines < _EVENTS_MIN:
+        return [Text()] * lines
+    made: list[RenderableType] = [Text("events, in UTC", style="dim")]
+    for event in view.events[1 - lines :]:
+        style = _EVENT_STYLES.get(str(event.get("kind")), "")
+        line = Text(str(event.get("time_utc", ""))[11:19] + "  ", style="dim", no_wrap=True, overflow="ellipsis")
+        made.append(line.append(event_words(event), style=style or "default"))
+    return [*made, *[Text()] * lines][:lines]
+
+
+def _help(lines: int) -> list[RenderableType]:
+    """The keys, and the commands that do the same from elsewhere, as far as the lines go."""
+    made: list[RenderableType] = [Text()]
+    for key, does, command in HELP:
+        line = Text(f"{key:>3}  ", style="bold", no_wrap=True, overflow="ellipsis").append(does, style="default")
+        made.append(line.append(f"   (membrane-ctrl ctl {command})" if command else "", style="dim"))
+    return [*made, *[Text()] * lines][:lines]
 
 
 def _headline(view: ConsoleView, config: Config) -> Text:
@@ -88,31 +166,38 @@ def _headline(view: ConsoleView, config: Config) -> Text:
         return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
     outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
     style = "bold red" if view.fault else "bold yellow" if outside else "bold"
-    return Text(view.why, style=style, overflow="fold")
+    line = Text(view.why, style=style, overflow="fold")
+    return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
 
 
-def _figures(view: ConsoleView, config: Config) -> Table:
+# in a low terminal these are omitted first
+_DISPENSABLE = ("", "gains", "flow", "lateness", "cycle", "gas", "mirror", "trend", "shape", "pump")
+
+
+def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]) -> Table:
     table = Table.grid(padding=(0, 1))
-    table.add_column(style="dim", justify="right", min_width=8, no_wrap=True)
+    table.add_column(style="dim", justify="right", min_width=_LABELS, no_wrap=True)
     table.add_column(ratio=1)
     row = view.row
     if row is None:
         table.add_row("", "waiting for the first tick")
         return table
-    table.add_row("error", _error(view, config))
-    for label, bars in _trend(view, config):
-        table.add_row(label, bars)
-    table.add_row("mirror", _mirror(row))
-    table.add_row("gains", Text(view.gains))
-    table.add_row("pump", _pump(row, config))
-    table.add_row("flow", _flow(row))
-    table.add_row("gas", _gas(view, row))
-    table.add_row("", "")
-    for label, line in _shape(view.shape):
-        table.add_row(label, line)
-    table.add_row("", "")
-    table.add_row("lateness", _lateness(view, row))
-    table.add_row("faults", _faults(view))
+    for label, line in (
+        ("error", _error(view, config)),
+        *trend,
+        ("mirror", _mirror(row)),
+        ("gains", Text(view.gains)),
+        ("pump", _pump(row, config)),
+        ("flow", _flow(row)),
+        ("gas", _gas(view, row)),
+        ("", Text()),
+        *_shape(view.shape),
+        ("", Text()),
+        ("lateness", _lateness(view, row)),
+        ("faults", _faults(view)),
+    ):
+        if label not in omitted:
+            table.add_row(label, line)
     if view.recording:  # one line only: with a full disk every file reports an error
         table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table
@@ -130,10 +215,12 @@ def _error(view: ConsoleView, config: Config) -> Text:
     return text
 
 
-def _trend(view: ConsoleView, config: Config) -> list[tuple[str, Text]]:
-    full_um = full_scale(view.trend_um, config.limits.band_um * _CALM)
-    upper, lower = signed_bars(view.trend_um, full_um, config.limits.band_um)
-    return [(f"+{full_um:g} um", upper), (f"-{full_um:g} um", lower)]
+def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[tuple[str, Text]]:
+    """The bars of the last seconds with their labels; a blank label is not an item that can be omitted."""
+    shown = view.trend_um[-max(1, seconds) :]
+    full_um = full_scale(shown, config.limits.band_um * _CALM)
+    labels = [f"+{full_um:g} um", *[" "] * (2 * rows - 2), f"-{full_um:g} um"]
+    return list(zip(labels, signed_bars(shown, full_um, config.limits.band_um, rows), strict=True))
 
 
 def _mirror(row: telemetry.TelemetryRow) -> Text:

@@ -20,6 +20,12 @@ _STATES = {
     State.LOWER: "pump is being stopped: the run is ending",
     State.FAULT: "pump is off: a person must clear the latched fault",
 }
+# the command that ends a state in which somebody is waited for, and its key
+_GO_ON = {
+    State.STANDBY: ("hold", " or key h"),
+    State.MANUAL: ("hold", " or key h"),
+    State.FAULT: ("ack", ""),
+}
 _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
@@ -40,6 +46,20 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_outside(row)}"
     return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
+
+
+def go_on(row: TelemetryRow, told: str, ctl: str, keys: bool) -> str:
+    """How to go on from a state that waits for a person, empty in others; `ctl` begins a command for this run."""
+    state = State(int(row.state))
+    if state == State.STANDBY and told.startswith("standby: locked"):
+        state = State.FAULT
+    command, key = ("resume", " or key p") if is_paused(row, told) else _GO_ON.get(state, ("", ""))
+    return f"go on: `{ctl} {command}`{key if keys else ''}" if command else ""
+
+
+def is_paused(row: TelemetryRow, told: str) -> bool:
+    """Whether the loop is paused."""
+    return row.state == State.HOLD and told.startswith("paused")
 
 
 def _outside(row: TelemetryRow) -> str:

@@ -165,14 +165,25 @@ class ChildProcesses:
     """Recorder, console, acquisition and alarms of one run. The hold continues without them and reports it."""
 
     def __init__(
-        self, config: Config, clock: RunClock, rings: Rings, run_dir: Path, name: str, duration_s: float | None
+        self,
+        config: Config,
+        clock: RunClock,
+        rings: Rings,
+        run_dir: Path,
+        name: str,
+        duration_s: float | None,
+        socket: Path | None,
     ) -> None:
+        from membrane_ctrl.console.keys import Keyboard
         from membrane_ctrl.console.process import ConsoleSpec
         from membrane_ctrl.recorder.process import RecorderSpec
 
         self._clock = clock
         self._summary = run_dir / "summary.json"
-        console = ConsoleSpec(clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s)
+        self._keyboard = Keyboard.of_stdin()
+        console = ConsoleSpec(
+            clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s, socket, self._keyboard
+        )
         recorder = RecorderSpec(run_dir, name, clock, config, rings.inputs, rings.events, rings.shapes, rings.frames)
         self._console = ManagedChild(
             _makes("screen", "console", 5, lambda n: replace(console, since_s=clock.now()) if n else console)
@@ -193,6 +204,11 @@ class ChildProcesses:
     @property
     def _managed(self) -> list[ManagedChild]:
         return [each for each in (self._recorder, self._acquisition, self._alarms, self._console) if each is not None]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the processes."""
+        return [managed.child.name for managed in self._managed]
 
     def start(self, stack: ExitStack) -> None:
         """Start all children; the stack stops those that `take_down` has not."""
@@ -238,7 +254,7 @@ class ChildProcesses:
         if not console.join(_CHILD_STOPS_S):
             console.stop(0.0)
         if console.exit_code != 0:
-            give_back_terminal()
+            give_back_terminal(self._keyboard)
 
 
 def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:

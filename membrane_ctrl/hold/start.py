@@ -21,7 +21,7 @@ from pathlib import Path
 from firmware_iface.drivers.pump_board import NO_CLAIM
 from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
 from membrane_ctrl.alarms.senders import require_sendable
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
@@ -70,20 +70,25 @@ def hold_mirror(options: HoldOptions) -> int:
     clock = RunClock.start()
     # SIGTERM before and after the ticks cleans up as well
     with terminal.ends_as_by_ctrl_c(), contextlib.ExitStack() as stack:
+        logs_dir = options.logs_dir or Path(options.config.recording.logs_dir)
+        # a second hold ends here, devices untouched
+        listeners = sockets.listeners_for(options.config.port, logs_dir, stack)
         twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
         config = twin.config if twin else options.config
         assert config.devices is not None
-        logs_dir = options.logs_dir or Path(config.recording.logs_dir)
-        listeners = sockets.listeners_for(config.port, logs_dir, stack)  # a second hold ends here, devices untouched
         stack.enter_context(locked(device_names(config.devices)))  # one with other folders ends here
         latched = _latched(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
+        terminal.progress(f"connecting to {config.devices.name}")
         board = asyncio.run(_identify(open_bench(config.devices), config, options, resumes))
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.keep(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
         ring.publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
-        children = child_processes.ChildProcesses(config, clock, rings, run_dir, options.name, options.duration_s)
+        children = child_processes.ChildProcesses(
+            config, clock, rings, run_dir, options.name, options.duration_s, listeners.path
+        )
+        terminal.progress(f"run folder {run_dir}; starting {', '.join(children.names)}")
         children.start(stack)
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(server.Port, config.port, listeners, run_dir.name)
@@ -258,20 +263,22 @@ def _capture(
 
 @contextlib.contextmanager
 def _signals(supervisor: Supervisor) -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe state."""
+    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe state; no Ctrl-Z."""
     loop = asyncio.get_running_loop()
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup`: continue without the terminal
         numbers.append(signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: signal.getsignal(number) for number in [*numbers, signal.SIGTSTP]}
     for number in numbers:
         loop.add_signal_handler(number, supervisor.ask, commands.Command("stop", number.name))
+    signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # Ctrl-Z: without ticks the board's watchdog stops the pump
     try:
         yield
     finally:
         for number in numbers:
             loop.remove_signal_handler(number)
-            signal.signal(number, before[number])  # asyncio leaves the default: an end without clean-up
+        for number, handler in before.items():
+            signal.signal(number, handler)  # asyncio leaves the default: an end without clean-up
 
 
 def _report(run_dir: Path, as_json: bool) -> None:
@@ -294,7 +301,8 @@ def _report(run_dir: Path, as_json: bool) -> None:
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
     if any(run_dir.glob("*.rrd")):
-        print(f"open it:    membrane-ctrl review {shlex.quote(str(run_dir))}", file=sys.stderr)
+        newest = run_dir.parent == Path(RecordingConfig().logs_dir)  # where `review` looks for `last`
+        print(f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}", file=sys.stderr)
 
 
 def _headline(summary: dict[str, object]) -> Iterator[str]:

@@ -7,6 +7,7 @@ reorder a line. Each such character becomes its JSON escape, so that JSON stays 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import unicodedata
@@ -118,6 +119,20 @@ def _refused(letter: str) -> bool:
 def _escape(letter: str) -> str:
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
+
+
+def in_foreground(handle: int) -> bool:
+    """Whether this process may use an open terminal now; job control covers only the controlling one."""
+    try:
+        return os.tcgetpgrp(handle) == os.getpgrp()
+    except OSError:
+        return True
+
+
+def progress(words: str) -> None:
+    """Print a line of progress on stderr; a reader that has gone is no error."""
+    with contextlib.suppress(OSError):
+        print(words, file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager

@@ -1,9 +1,9 @@
 """Child processes: started with `spawn`, shielded from the terminal, and never left behind.
 
-Ctrl-C, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every process of the group. Only
-the control process may act on them: the safe state comes before the end of recording and alarms. So the children
-block these signals from their first instruction on, and end on a different one; examples/membrane-ctrl.service relies
-on this.
+Ctrl-C, Ctrl-Z, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every process of the
+group. Only the control process may act on them: the safe state comes before the end of recording and alarms. So the
+children block these signals from their first instruction on, and end on a different one;
+examples/membrane-ctrl.service relies on this.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from typing import Any
 from membrane_ctrl.model import events, terminal
 
 _CONTEXT = multiprocessing.get_context("spawn")
-_OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
+_OF_THE_GROUP = (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM, signal.SIGTSTP)
 # A child without a handler for it yet simply ends.
 STOP = signal.SIGUSR1
 

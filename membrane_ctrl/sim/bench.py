@@ -2,9 +2,9 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +15,7 @@ from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, Exit
+from membrane_ctrl.model.terminal import progress
 from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.sim.lab import Lab
@@ -33,6 +34,7 @@ class BenchSpec:
     pump: PumpConfig
     clock: RunClock  # the run's clock, which stamps the truth
     port: int  # where to listen; 0: any free port
+    only_there: bool = True  # False: at any free port if this one is taken
     host: str = "127.0.0.1"
     speed: float = 1.0  # plant seconds a second
     truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
@@ -49,6 +51,11 @@ class BenchReport:
     port: int = 0
     error: str = ""
     lab: DevicesConfig | None = None
+
+    @property
+    def url(self) -> str:
+        """Address of the pump board."""
+        return f"tcp://127.0.0.1:{self.port}"
 
 
 def serve(spec: BenchSpec, ready: Connection) -> None:
@@ -69,12 +76,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
     with _truth_writer(spec.truth) as writer:
         try:
             bench = LiveBench(spec, writer)
-            served = (
-                pump_board.PumpBoardEmulator(bench, spec.host, spec.port)
-                if spec.lab is None
-                else Lab(bench, spec.lab)
-            )
-            started = await served.start()
+            served, started = await _listening(bench, spec)
         except ValueError as error:
             ready.send(BenchReport(error=str(error)))
             return
@@ -89,6 +91,24 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             await _keep_running(bench, spec, stop)
         finally:
             await served.stop()
+
+
+async def _listening(
+    bench: "LiveBench", spec: BenchSpec
+) -> tuple[pump_board.PumpBoardEmulator | Lab, DevicesConfig | None]:
+    """The emulated board or instruments, and the addresses of the latter. Raises OSError."""
+    if spec.lab is not None:
+        lab = Lab(bench, spec.lab)
+        return lab, await lab.start()
+    board = pump_board.PumpBoardEmulator(bench, spec.host, spec.port)
+    try:
+        await board.start()
+    except OSError as error:
+        if spec.only_there or error.errno != errno.EADDRINUSE:
+            raise
+        board = pump_board.PumpBoardEmulator(bench, spec.host, 0)
+        await board.start()
+    return board, None
 
 
 async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event) -> None:
@@ -164,7 +184,8 @@ _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 
 def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
-    """Start the bench process, which the stack ends, and wait until it listens. Raises DeviceError."""
+    """Start the bench process, which the stack ends, and wait until it listens; print where. Raises DeviceError."""
+    progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
     ours, theirs = pipe()
     child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
     stack.callback(child.stop, 2.0)
@@ -172,7 +193,16 @@ def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
     report: BenchReport = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
     if report.error:
         raise DeviceError(report.error)
+    if spec.lab is None:
+        moved = f" (port {spec.port} is taken)" if spec.port not in (0, report.port) else ""
+        progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
     return report
+
+
+def _spec(config: Config, clock: RunClock) -> BenchSpec:
+    """The bench of a configuration; the default port may be another twin's, a configured one is meant."""
+    twin = config.twin
+    return BenchSpec(twin, config.pump, clock, twin.port, only_there="port" in twin.model_fields_set)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +221,10 @@ class TwinProcess:
         With `lab` it answers as the configured instruments, else as the pump board.
         """
         truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
-        spec = BenchSpec(
-            config.twin, config.pump, clock, config.twin.port, truth=truth, lab=config.devices if lab else None
-        )
+        spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = _started(spec, stack)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
-        devices = report.lab or DevicesConfig(board=f"tcp://127.0.0.1:{report.port}", **watchdog)
+        devices = report.lab or DevicesConfig(board=report.url, **watchdog)
         return cls(config.model_copy(update={"devices": devices}), truth)
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
@@ -220,10 +248,9 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 def serve_twin(config: Config, speed: float) -> int:
     """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a busy port."""
-    spec = BenchSpec(config.twin, config.pump, RunClock.start(), config.twin.port, speed=speed, linger_s=0.0)
     with contextlib.ExitStack() as stack:
-        url = f"tcp://127.0.0.1:{_started(spec, stack).port}"
-        print(f"the twin listens on {url}, Modbus unit 1; stop it with Ctrl-C", file=sys.stderr)
+        _started(replace(_spec(config, RunClock.start()), speed=speed, linger_s=0.0), stack)
+        progress("stop it with Ctrl-C")
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
     return Exit.INTERRUPTED if stopped == signal.SIGINT else Exit.DONE

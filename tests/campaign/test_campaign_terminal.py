@@ -6,6 +6,8 @@ import asyncio
 import os
 import pty
 import signal
+import termios
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -96,6 +98,37 @@ async def test_the_terminal_of_a_screen_that_hangs_at_the_end_is_usable(tmp_path
         assert await run.ended() == Exit.INTERRUPTED
         await asyncio.sleep(0.2)
         assert terminal.usable
+
+
+async def test_keys_are_commands_that_are_recorded(tmp_path: Path) -> None:
+    async with on_terminal(tmp_path) as (run, terminal):
+        before = termios.tcgetattr(terminal.theirs)
+        assert not before[3] & termios.ECHO
+        terminal.press(b"m")
+        await run.until(lambda: b"Enter sends" in terminal.seen)
+        terminal.press(b"door\r")
+        await run.until(lambda: run.happened("command", command="mark", text="door", why="key"))
+        terminal.press(b"\x1a")  # Ctrl-Z
+        await run.until(lambda: b"Ctrl-Z does nothing" in terminal.seen)
+        terminal.press(b"s")
+        await run.until(lambda: b"stop the run?" in terminal.seen)
+        terminal.press(b"y")
+        assert await run.ended() == Exit.INTERRUPTED
+        await asyncio.sleep(0.2)
+        assert terminal.usable
+        assert termios.tcgetattr(terminal.theirs)[3] & termios.ECHO
+        assert run.happened("end", missed_ticks=0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT])
+async def test_the_terminal_of_a_hold_that_was_killed_is_usable(tmp_path: Path, number: signal.Signals) -> None:
+    async with on_terminal(tmp_path) as (run, terminal):
+        run.signal(number)
+        await run.ended()
+        until_s = time.monotonic() + 10.0
+        while not (terminal.usable and termios.tcgetattr(terminal.theirs)[3] & termios.ECHO):
+            assert time.monotonic() < until_s
+            await asyncio.sleep(0.1)
 
 
 @pytest.mark.usefixtures("signals_are_heeded")

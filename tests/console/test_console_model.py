@@ -9,7 +9,7 @@ import pytest
 from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel, Trend, text
+from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, text
 from membrane_ctrl.model.states import Rung, ShapeState, State
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S
 
@@ -24,7 +24,7 @@ def test_trend_is_the_mean_of_each_second_with_gaps() -> None:
     for mono_s, value in ((1.0, 1.0), (1.5, 3.0), (2.0, math.nan), (3.9, 5.0)):
         trend.add(mono_s, value)
     means = trend.means()
-    assert len(means) == 60
+    assert len(means) == TREND_S
     assert means[-3] == 2.0
     assert math.isnan(means[-2])
     assert means[-1] == 5.0
@@ -36,7 +36,8 @@ def test_trend_forgets_after_a_minute_even_across_a_gap() -> None:
     trend.add(0.0, 1.0)
     trend.add(70.0, 2.0)
     assert trend.values() == [2.0]
-    assert [mean for mean in trend.means() if math.isfinite(mean)] == [2.0]
+    assert [mean for mean in trend.means() if math.isfinite(mean)] == [1.0, 2.0]
+    assert all(math.isnan(mean) for mean in trend.means()[-70:-1])
 
 
 def test_last_minute_of_the_error() -> None:

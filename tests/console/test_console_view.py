@@ -11,9 +11,9 @@ from console_feed import FAULT, HOLDING, NOTHING, event, rows, shape
 from rich.console import Console
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import ConsoleModel
-from membrane_ctrl.console.process import at_once, event_line, line
-from membrane_ctrl.console.view import console_panel, full_scale, level_bar, signed_bars
+from membrane_ctrl.console.model import ConsoleModel, event_line
+from membrane_ctrl.console.process import at_once, line
+from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import duration, number, percent
 from membrane_ctrl.model.states import Rung, ShapeState, State
 
@@ -29,9 +29,11 @@ def held(duration_s: float | None = 120.0) -> ConsoleModel:
     return model
 
 
-def drawn(model: ConsoleModel, now_s: float = 75.0, width: int = 80) -> list[str]:
-    console = Console(width=width, record=True, file=io.StringIO())
-    console.print(console_panel(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo"))
+def drawn(
+    model: ConsoleModel, now_s: float = 75.0, width: int = 80, height: int = 24, foot: str = "", help_: bool = False
+) -> list[str]:
+    console = Console(width=width, height=height, record=True, file=io.StringIO())
+    console.print(ConsolePage(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_))
     return console.export_text().rstrip("\n").splitlines()
 
 
@@ -80,6 +82,61 @@ def test_it_fits(width: int, wrong: bool) -> None:
     page = drawn(everything_wrong() if wrong else held(), width=width)
     assert len(page) <= 24
     assert all(len(row) == width for row in page)
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 15), (70, 18), (80, 24), (132, 43), (250, 70)])
+@pytest.mark.parametrize("wrong", [False, True])
+@pytest.mark.parametrize("help_", [False, True])
+def test_every_terminal_is_used_and_none_overflows(width: int, height: int, wrong: bool, help_: bool) -> None:
+    page = drawn(everything_wrong() if wrong else held(), width=width, height=height, foot="h hold", help_=help_)
+    assert len(page) <= height
+    assert all(len(row) == width for row in page)
+    assert page[-2][2:].startswith("h hold")  # the last line inside
+    assert any("error" in row for row in page)
+    assert any("faults" in row for row in page)
+    if height >= 43 and not help_:
+        assert len(page) == height
+        assert sum("█" in row or "▇" in row for row in page) >= 4  # higher bars
+    if (height, wrong) != (15, True):  # a fault takes the space of the help
+        assert any("start to hold" in row for row in page) == help_
+
+
+def test_a_wide_terminal_shows_a_longer_trend() -> None:
+    model = ConsoleModel(CONFIG)
+    for row in rows(150.0):
+        model.take_row(row)
+    page = drawn(model, now_s=150.0, width=160)
+    upper, lower = (next(row for row in page if f"{sign}1 um" in row or f"{sign}2 um" in row) for sign in "+-")
+    both = [a != " " or b != " " for a, b in zip(upper[12:-2], lower[12:-2], strict=True)]
+    assert sum(both) > 140
+
+
+def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> None:
+    model = held()
+    for k in range(70):
+        model.take_event(event(70.0, "command", command="setpoint", who="unix:ann", why=f"step {k}"))
+    model.take_event(event(70.0, "command", command="hold", who="unix:tom", why="", refused="not now"))
+    model.take_event(event(70.0, "why", why="only the headline says this"))
+    page = "\n".join(drawn(model, width=100, height=40))
+    assert "03:12:00  COMMAND setpoint step 69, by unix:ann" in page
+    assert "COMMAND hold, by unix:tom; refused: not now" in page
+    assert "step 20" not in page
+    assert "only the headline" not in page
+
+
+def test_who_waits_for_a_person_says_how_to_go_on() -> None:
+    model = ConsoleModel(CONFIG, ctl="membrane-ctrl ctl --socket x/control.sock", keys=True)
+    model.take_row(replace(HOLDING, state=State.STANDBY))
+    assert any("go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row for row in drawn(model, 0.0))
+    model.take_event(event(0.0, "why", why="standby: locked: hands inside"))
+    view = model.view(0.0)
+    assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
+    assert line(view).endswith(view.go_on)
+    model.take_row(HOLDING)
+    assert model.view(0.0).go_on == ""
+    model.take_event(event(0.0, "why", why="paused: the pump keeps its mean flow"))
+    assert model.view(0.0).paused
+    assert model.view(0.0).go_on.endswith("resume` or key p")
 
 
 def test_fault_and_its_remedy_are_seen() -> None:

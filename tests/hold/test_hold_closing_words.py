@@ -29,7 +29,14 @@ def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.Captu
     assert "starts at" not in words(tmp_path, capsys)
 
 
-def test_only_a_recording_that_is_there_is_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_a_recording_that_is_there_is_offered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert "open it" not in words(tmp_path, capsys)
     (tmp_path / "hold-000.rrd").touch()
-    assert f"open it:    membrane-ctrl review {tmp_path}" in words(tmp_path, capsys)
+    assert f"open it:    membrane-ctrl review {tmp_path}\n" in words(tmp_path, capsys)
+    monkeypatch.chdir(tmp_path)
+    run_dir = Path("logs/20261122T031200Z-hold")
+    run_dir.mkdir(parents=True)
+    (run_dir / "hold-000.rrd").touch()
+    assert "open it:    membrane-ctrl review last\n" in words(run_dir, capsys)

@@ -155,6 +155,14 @@ def test_a_busy_port_is_one_line_and_an_end() -> None:
             assert process.exitcode == 0
 
 
+def test_beside_another_twin_any_free_port_will_do() -> None:
+    with bench(spec()) as (_, first), bench(spec(port=first.port, only_there=False)) as (_, second):
+        assert second.error == ""
+        assert second.port not in (0, first.port)
+        with Client(first.port) as client:  # the first still answers there
+            assert client.read("sensors")["pump_readback_fraction"] == 0.0
+
+
 def test_an_impossible_plant_is_one_line_and_an_end() -> None:
     with bench(spec(pump=PumpConfig(dead_fraction=1.0))) as (process, report):
         assert "dead_fraction" in report.error
