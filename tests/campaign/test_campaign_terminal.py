@@ -108,6 +108,7 @@ async def test_keys_are_commands_that_are_recorded(tmp_path: Path) -> None:
         await run.until(lambda: b"Enter sends" in terminal.seen)
         terminal.press(b"door\r")
         await run.until(lambda: run.happened("command", command="mark", text="door", why="key"))
+        await run.until(lambda: b"mark: done" in terminal.seen)
         terminal.press(b"\x1a")  # Ctrl-Z
         await run.until(lambda: b"Ctrl-Z does nothing" in terminal.seen)
         terminal.press(b"s")
