@@ -13,7 +13,7 @@ from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterM
 _HERE = Path(__file__).resolve().parent
 HEADER_PATH = _HERE / "membrane_board.h"
 DOCS_PATH = _HERE.parent / "docs" / "registers.md"
-_SOURCE = "firmware_iface/registers.toml by python -m firmware_iface.generate"
+_SOURCE = "firmware_iface/registers.toml with python -m firmware_iface.generate"
 
 
 def markdown(registers: RegisterMap) -> str:
@@ -21,7 +21,7 @@ def markdown(registers: RegisterMap) -> str:
     lines = [
         "# Registers of the membrane pump board",
         "",
-        f"Made from {_SOURCE}; do not edit.",
+        f"Generated from {_SOURCE}; do not edit.",
         "",
         f"Map version {registers.map_version}, device kind {registers.device_kind} (0x{registers.device_kind:04X}).",
         "`since` is the first map version that has a register; a board of an earlier version has the map without it.",
@@ -31,7 +31,7 @@ def markdown(registers: RegisterMap) -> str:
         f"An `i32` of {I32_NO_VALUE} means that there is no value. A write outside the limits is answered with",
         "exception 3 and changes nothing; one to a read-only or unknown address, or to half a value, with 2.",
         "From map version 2 on, a part of a block is refused with 2, and a write without the claim in force with 6",
-        "while somebody holds the board, with 3 while nobody does ([firmware](firmware.md#claim)).",
+        "while a program holds the board, with 3 otherwise ([firmware](firmware.md#claim)).",
     ]
     for block in registers.blocks:
         lines += ["", *_markdown_block(block)]
@@ -65,7 +65,7 @@ def _markdown_row(register: Register) -> str:
 def c_header(registers: RegisterMap) -> str:
     """The map as a C header (C89 and later, preprocessor only) for authors of firmware."""
     lines = [
-        f"/* Registers of the membrane pump board. Made from {_SOURCE}; do not edit.",
+        f"/* Registers of the membrane pump board. Generated from {_SOURCE}; do not edit.",
         " * Modbus holding registers, addresses from 0, big word first. value = raw / COUNTS_PER_UNIT. */",
         "#ifndef MEMBRANE_BOARD_H",
         "#define MEMBRANE_BOARD_H",

@@ -1,4 +1,4 @@
-/* Registers of the membrane pump board. Made from firmware_iface/registers.toml by python -m firmware_iface.generate; do not edit.
+/* Registers of the membrane pump board. Generated from firmware_iface/registers.toml with python -m firmware_iface.generate; do not edit.
  * Modbus holding registers, addresses from 0, big word first. value = raw / COUNTS_PER_UNIT. */
 #ifndef MEMBRANE_BOARD_H
 #define MEMBRANE_BOARD_H

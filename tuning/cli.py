@@ -32,7 +32,7 @@ VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")
 YesOption = Annotated[bool, typer.Option("--yes", help="Apply the proposal without asking.")]
 ChooseOption = Annotated[str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take the command from whoever has it.")]
+TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
 
 _STEPS = {
     "characterise": "Excite the loop with a relay and doublets about the mean flow; starts a session.",

@@ -12,7 +12,7 @@ from firmware_iface.links import modbus_rtu, modbus_tcp
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
 NO_CLAIM = (
-    "this board knows no claim (register map 1): whatever reaches it can run its pump, and two programs on two "
+    "this board has no claim (register map 1): any program that reaches it can run its pump, and two programs on two "
     "machines are not kept apart; update its firmware"
 )
 _HEARTBEATS = 2**16

@@ -123,7 +123,7 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
         except ValueError:
             raise errors.InputError(f"--free {text}: {amount} is not a number") from None
         if not (math.isfinite(out[name]) and out[name] >= 0):
-            raise errors.InputError(f"--free {text}: a sigma is 0 (hold it) or more")
+            raise errors.InputError(f"--free {text}: a sigma must be 0 (which holds it) or more")
     return out
 
 

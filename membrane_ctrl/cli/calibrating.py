@@ -109,7 +109,7 @@ def calibrate(
     logs: Annotated[Path, typer.Option(help="--live: put sessions in LOGS/calibration.")] = Path("logs"),
     run: Annotated[Path | None, typer.Option(help="--live: run folder of the hold.")] = None,
     socket: Annotated[Path | None, typer.Option(help="--live: control port of the hold.")] = None,
-    take_over: Annotated[bool, typer.Option("--take-over", help="--live: take over the command.")] = False,
+    take_over: Annotated[bool, typer.Option("--take-over", help="--live: take command from whoever has it.")] = False,
 ) -> int:
     """Calibrate the optics: one geometry with its covariance, from sets at several pressures."""
     from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command

@@ -60,7 +60,7 @@ class ActionFirst(TyperGroup):
 
 
 ctl_app = typer.Typer(
-    cls=ActionFirst, no_args_is_help=True, help="Talk to a running hold: ask for its status, or tell it what to do."
+    cls=ActionFirst, no_args_is_help=True, help="Control a running hold: show its status, or send a command."
 )
 
 

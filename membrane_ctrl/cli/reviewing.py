@@ -165,7 +165,7 @@ def prune_runs(
         float | None,
         typer.Option(min=0, max=1e6, help="Then delete the oldest until the rest take at most this, GB."),
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Actually delete; the default is a dry run.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete them; by default only list them.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Delete old runs; --keep-days spares the newest three, and a run with a file `.keep` always stays."""

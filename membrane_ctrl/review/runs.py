@@ -42,7 +42,7 @@ def show_command(run: Path, json: bool) -> int:
         return 0
     _console().print(_table([entry]))
     if besides := beside(entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s):
-        print(f"  beside what was held: {', '.join(besides)}")
+        print(f"  not counted as held: {', '.join(besides)}")
     for each in opened.log:
         match each.event:
             case events.StateEntered(state=said) | events.Fault(name=said) | Mark(text=said) | Ended(exit=said):

@@ -185,7 +185,7 @@ def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> N
     slow = bench.devices.model_copy(update={"watchdog_s": 10.0})
     probe = asyncio.run(probe_board(pump_board(slow, str(slow.board)), "board"))
     assert probe.problem == ""
-    assert ("knows no claim" in probe.notes) == (version == 1)
+    assert ("has no claim" in probe.notes) == (version == 1)
     assert bench.board.state.read(48, 2) + bench.board.state.read(56, 3) == before
     assert (bench.read().pump_fraction, bench.read().foreign) == (0.5, 0)
     bench.now_s += 0.51

@@ -77,7 +77,7 @@ def test_every_place_states_the_same_quality(folder: Path, rows: Rows, capsys: p
     assert "paused 40 s (9." in report["sentence"]
     assert command(["runs", "show", str(folder)]) == 0
     shown = capsys.readouterr().out
-    assert "beside what was held: faults " in shown
+    assert "not counted as held: faults " in shown
     assert "paused 40 s" in shown
     assert [odd["seen"][:4] for odd in report["anomalies"] if odd["name"] == "paused"] == ["40 s"]
 

@@ -99,7 +99,7 @@ def _astray(solution: Solution) -> CalibrationFinding:
         if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
             says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
             return CalibrationFinding(True, says, tuple(range(k, count)))
-    says = "the sets do not show one bench: they are of different rigs, or several of them are bad"
+    says = "the sets do not show one bench: they are of different benches, or several of them are bad"
     return CalibrationFinding(True, says)
 
 

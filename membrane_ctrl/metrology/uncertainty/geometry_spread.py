@@ -33,9 +33,9 @@ class GeometrySpread:
 
     def __post_init__(self) -> None:
         if len(set(self.names)) != len(self.names):
-            raise ValueError("names: one is there twice")
+            raise ValueError("names: one occurs twice")
         if not (set(self.names) <= set(SHORT_NAMES) or set(self.names) <= set(GENERAL_NAMES)):
-            raise ValueError(f"names: either of {', '.join(SHORT_NAMES)} or of {', '.join(GENERAL_NAMES)}")
+            raise ValueError(f"names: all from {', '.join(SHORT_NAMES)} or all from {', '.join(GENERAL_NAMES)}")
         if self.covariance.shape != (len(self.names), len(self.names)):
             raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
         if not np.all(np.isfinite(self.covariance)) or not np.allclose(self.covariance, self.covariance.T):

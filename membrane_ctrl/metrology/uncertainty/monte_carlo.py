@@ -92,7 +92,7 @@ class TrialBench:
         with np.errstate(over="ignore", invalid="ignore"):  # of a fit that diverges, which is reported below
             fit = reconstruct.solve(tracer, points, self.surface, normal=self.normal)
         if not fit.converged:
-            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide to be a spread")
+            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
         return fit.surface.parameters
 
     def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:

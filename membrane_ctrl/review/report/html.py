@@ -138,7 +138,7 @@ def _details(analysis: Analysis) -> str:
     single = f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
     return _facts([
         (f"drift, {name}", _slope(series.drift, "µm/h")),
-        ("beside what was held", ", ".join(beside(ticks.faults_s, ticks.paused_s, ticks.moving_s,
+        ("not counted as held", ", ".join(beside(ticks.faults_s, ticks.paused_s, ticks.moving_s,
                                                   ticks.end_s - ticks.start_s)) or "nothing"),
         ("single laser readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
         (f"RMS by frequency, {name}", _bands(series)),
