@@ -78,8 +78,8 @@ def test_nothing_named_changes_nothing() -> None:
     ("names", "covariance", "text"),
     [
         (("a_mm", "a_mm"), np.eye(2), "twice"),
-        (("a_mm", "camera_shift_x_mm"), np.eye(2), "either of"),
-        (("focal_mm",), np.eye(1), "either of"),
+        (("a_mm", "camera_shift_x_mm"), np.eye(2), "all from"),
+        (("focal_mm",), np.eye(1), "all from"),
         (("a_mm",), np.eye(2), "as many rows"),
         (("a_mm", "b_mm"), np.array([[1.0, 0.5], [0.0, 1.0]]), "symmetric"),
         (("a_mm", "b_mm"), np.array([[1.0, 2.0], [2.0, 1.0]]), "eigenvalue"),
