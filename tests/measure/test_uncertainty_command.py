@@ -198,7 +198,7 @@ def test_dask_is_not_installed(
     [
         (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n', "needs 1 rows and columns"),
         (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[-1.0]]\n', "variance is negative"),
-        (SHORT + '[covariance]\nnames = ["a_m"]\nmatrix = [[1.0]]\n', "either of"),
+        (SHORT + '[covariance]\nnames = ["a_m"]\nmatrix = [[1.0]]\n', "all from"),
         (SHORT + '[covariance]\nnames = ["camera_shift_x_mm"]\nmatrix = [[1.0]]\n', "a, b and alpha"),
         (SHORT + '[covariance]\nnames = ["alpha_deg"]\nmatrix = [[2500.0]]\n', "too wide"),
         (SHORT + "[covariance]\nmatrix = [[1.0]]\n", "names"),
