@@ -21,11 +21,12 @@ _PARTS_MAX = 50
 _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
-def load(path: Path, model: type[Model], follow: bool = True) -> Model:
+def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
     """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source (`model.files`).
 
     Raises InputError with one line that names the file, the field and a valid value.
     """
+    path = Path(path)
     tables = read_toml(path, follow)
     optics = tables.get("optics")
     if isinstance(optics, dict):

@@ -36,8 +36,9 @@ class PortClient:
         self.greeting = greeting  # `run`, `you`, `role`, `commander`
 
     @classmethod
-    def unix(cls, path: Path, notice: Callable[[str], None]) -> PortClient:
+    def unix(cls, path: str | Path, notice: Callable[[str], None]) -> PortClient:
         """Connect to a socket file."""
+        path = Path(path)
         connection = socket.socket(socket.AF_UNIX)
         # While others crowd the endpoint, only a blocking connect waits its turn; with Python's own time-out it would
         # be refused at once.

@@ -91,11 +91,12 @@ class GeometryFile:
         return toml_file.parse({**dict(optics), **parts}, OpticsConfig, str(self.path))
 
 
-def read_geometry(path: Path) -> GeometryFile:
+def read_geometry(path: str | Path) -> GeometryFile:
     """Read a geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or a file from `calibrate`.
 
     Raises InputError, also for calibrated numbers edited by hand.
     """
+    path = Path(path)
     tables = toml_file.read_toml(path)
     calibrated = tables.get("schema") == plain_json.SCHEMA
     table = tables.get("geometry", tables)

@@ -96,11 +96,12 @@ class CaptureSet:
     lost: tuple[int, ...] = ()
 
 
-def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead:
+def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> CaptureHead:
     """Read `capture.toml`. Raises InputError.
 
     `geometry` replaces the set's own, with the lens and pitch calibrated with it.
     """
+    folder = Path(folder)
     path = folder / "capture.toml"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such capture set")
@@ -139,17 +140,18 @@ def read_head(folder: Path, geometry: GeometryFile | None = None) -> CaptureHead
     )
 
 
-def read_set(folder: Path, geometry: GeometryFile | None = None) -> CaptureSet:
+def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> CaptureSet:
     """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is usable."""
     head = read_head(folder, geometry)
     camera = head.optics.camera
     if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
         raise InputError(
-            f"{folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of {camera.width_px} x "
-            f"{camera.height_px} pixels exceed the limit of {_PIXELS_MAX / 1e6:.0f} million for a set"
+            f"{head.folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of "
+            f"{camera.width_px} x {camera.height_px} pixels exceed the limit of {_PIXELS_MAX / 1e6:.0f} million "
+            "for a set"
         )
     with ThreadPoolExecutor(_READERS) as pool:
-        images = list(pool.map(_read_image, [folder / name for name in head.files]))
+        images = list(pool.map(_read_image, [head.folder / name for name in head.files]))
     return assemble(head, images)
 
 

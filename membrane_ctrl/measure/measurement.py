@@ -52,7 +52,7 @@ class Measurement:
 
 
 def measure_set(
-    folder: Path,
+    folder: str | Path,
     geometry: GeometryFile | None = None,
     anchor: Anchor | None = None,
     start: HeightFunction | None = None,
@@ -61,7 +61,7 @@ def measure_set(
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         The set.
     geometry : GeometryFile, optional
         Replaces the set's own.
@@ -84,11 +84,11 @@ def measure_set(
     return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
 
 
-def read_anchor(folder: Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
+def read_anchor(folder: str | Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
     """Read the reference of fringes sets. Raises InputError if it gives no figure."""
     capture = read_set(folder, geometry)
     if capture.head.kind != "full":
-        raise errors.InputError(f"{folder / 'capture.toml'}: kind: a reference must be a full set")
+        raise errors.InputError(f"{capture.head.folder / 'capture.toml'}: kind: a reference must be a full set")
     try:
         return capture.head, check(stack_of(capture), capture.head.optics).anchor()
     except RejectedSetError as error:
@@ -183,7 +183,7 @@ class Figures:
         self._reference: Path | None = None
         self._anchor: tuple[CaptureHead, Anchor] | errors.CommandError = errors.CommandError("no reference read yet")
 
-    def of(self, folder: Path) -> SetFigure:
+    def of(self, folder: str | Path) -> SetFigure:
         """Read and measure a set.
 
         Raises InputError if the set or its reference is invalid; RejectedError if its frames give no usable figure.

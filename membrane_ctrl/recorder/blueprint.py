@@ -1,15 +1,12 @@
 """How a run opens in the viewer: one tab per question."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller import safety
-from membrane_ctrl.model.states import Rung, ShapeState, State
 from membrane_ctrl.recorder import summary_panel
 from membrane_ctrl.run_files import shapes, streams
 
@@ -199,16 +196,10 @@ class Lane:
 _CALM, _BUSY, _GOOD, _WARN, _BAD = 0x5A5A5AFF, 0x56B4E9FF, 0x009E73FF, 0xE69F00FF, 0xD55E00FF
 
 
-def _words(codes: type[IntEnum]) -> dict[int, str]:
-    return {int(code): code.name.lower() for code in codes}
-
-
-_FAULTS = {0: "none"} | {rule.code: rule.name for rule in safety.TABLE}
-
 STATE = Lane(
     "/state/controller",
     "state",
-    _words(State),
+    streams.WORDS["state"],
     {
         "standby": _CALM, "check": _BUSY, "inflate": _BUSY, "settle": _WARN, "hold": _GOOD,
         "manual": 0xCC79A7FF, "tune": 0xF0E442FF, "lower": _WARN, "fault": _BAD,
@@ -217,15 +208,16 @@ STATE = Lane(
 SHAPE = Lane(
     "/state/shape_loop",
     "shape_state",
-    _words(ShapeState),
+    streams.WORDS["shape_state"],
     {"off": _CALM, "waiting": _BUSY, "tracking": _GOOD, "suspended": _WARN},
 )
 RUNG = Lane(
     "/state/rung",
     "rung",
-    _words(Rung),
+    streams.WORDS["rung"],
     {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
 )
+_FAULTS = streams.WORDS["fault"]
 FAULT = Lane("/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM})
 VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejected": _BAD})
 

@@ -120,11 +120,12 @@ def entry(folder: Path) -> RunEntry:
     )
 
 
-def resolve(run: Path, logs_dir: Path = Path("logs")) -> Path:
+def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     """Find the run's folder: a path; a run's name, or the end of it, below `logs`; or `last`.
 
     Raises InputError if no run, or more than one, matches.
     """
+    run, logs_dir = Path(run), Path(logs_dir)
     if run.exists() or not logs_dir.is_dir():
         return run
     folders = _folders(logs_dir)

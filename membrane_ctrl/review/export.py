@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
@@ -15,7 +14,7 @@ from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_t
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files.column_file import FOLDER
 from membrane_ctrl.run_files.run import Run
-from membrane_ctrl.run_files.streams import STREAMS
+from membrane_ctrl.run_files.streams import STREAMS, named_table
 
 
 def refuse_originals(folder: Path) -> None:
@@ -36,7 +35,12 @@ _SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
 def export(
-    run: Run, to: str, out: Path, streams: Sequence[str] = (), start_s: float = -math.inf, end_s: float = math.inf
+    run: Run,
+    to: str,
+    out: str | Path,
+    streams: Sequence[str] = (),
+    start_s: float = -math.inf,
+    end_s: float = math.inf,
 ) -> list[Path]:
     """Write a run's columns.
 
@@ -47,7 +51,7 @@ def export(
     ----------
     to : str
         One of `FORMATS`.
-    out : Path
+    out : str or Path
         Folder for the files: `ticks.<format>`, `shapes.<format>`, `events.jsonl`; HDF5 is one file `run.h5`.
     streams : sequence of str
         Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by default.
@@ -57,6 +61,7 @@ def export(
     if to not in FORMATS:
         raise errors.InputError(f"--format {to}: known: {', '.join(FORMATS)}")
     fields, extras = _selected(streams)
+    out = Path(out)
     refuse_originals(out)
     with errors.writing(out, errors.DeviceError):
         make_folder(out)
@@ -73,10 +78,10 @@ def _files(
 ) -> list[Path]:
     written = []
     if fields:
-        blocks = (pa.table(block) for block in run.tick_blocks(fields, start_s, end_s))
+        blocks = (named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s))
         written += _tables(blocks, out / f"ticks.{to}", to)
         _say_if_missing(run, bool(written))
-    if SHAPES in extras and (shapes := shape_table(run, start_s, end_s)).num_rows:
+    if SHAPES in extras and (shapes := run.cycles(start_s, end_s)).num_rows:
         written += _tables(iter([shapes]), out / f"shapes.{to}", to)
     if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
         path = out / "events.jsonl"
@@ -98,17 +103,6 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
 
 def _nothing(run: Run) -> errors.InputError:
     return errors.InputError("; ".join((f"{run.folder}: nothing to export of the requested data", *run.notes)))
-
-
-def shape_table(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> pa.Table:
-    """One row per cycle: time, Z1..Z36 in um, sag, quality, verdict."""
-    shapes = run.shapes()
-    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
-    names = (*_SHAPE_COLUMNS, "slope_residual_urad", "valid_fraction", "latency_s")
-    columns: dict[str, object] = {"time_s": shapes.time_s}
-    columns |= {f"z{j}_um": np.ascontiguousarray(shapes.coeffs_um[:, j - 1]) for j in range(1, 37)}
-    columns |= {name: getattr(shapes, name) for name in names}
-    return pa.table(columns | {"verdict": [str(word) for word in shapes.verdict]})
 
 
 def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:

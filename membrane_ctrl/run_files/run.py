@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes, tables
+from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes, streams, tables
 from membrane_ctrl.run_files.column_file import SUFFIX
 from membrane_ctrl.run_files.segments import is_closed
 from membrane_ctrl.run_files.shapes import Shapes
@@ -90,22 +90,44 @@ class Run:
         return tuple(each for each in self.log if start_s <= each.mono_s < end_s)
 
     def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
-        """Telemetry as an Arrow table (`.to_pandas()` where pandas is installed).
+        """Telemetry, one row per tick.
 
         Parameters
         ----------
         names : sequence of str, optional
-            Fields of `telemetry.TelemetryRow`; all by default. `mono_s` is always there.
+            Fields of `telemetry.TelemetryRow`; all by default.
         start_s, end_s : float
             Part of the run to read.
+
+        Returns
+        -------
+        pyarrow.Table
+            `time_s` (seconds of the run), `time_utc` and the fields; codes are names, absent values null.
         """
-        wanted = _with_time(names or FIELDS)
-        blocks = [pa.table(block) for block in self.tick_blocks(wanted, start_s, end_s)]
-        empty = pa.table({name: np.empty(0) for name in wanted})
-        return pa.concat_tables(blocks, promote_options="permissive") if blocks else empty
+        wanted = _with_time([name for name in names or FIELDS if name not in streams.TIMES])
+        blocks = list(self.tick_blocks(wanted, start_s, end_s)) or [{name: np.empty(0) for name in wanted}]
+        parts = [streams.named_table(block, self.origin_utc) for block in blocks]
+        return pa.concat_tables(parts, promote_options="permissive").unify_dictionaries()
+
+    def overview(
+        self, window_s: float = 10.0, start_s: float = -np.inf, end_s: float = np.inf, names: Sequence[str] = ()
+    ) -> pa.Table:
+        """Minimum, mean and maximum of each signal in windows of 1, 10 or 60 s, all by default: quick for a month.
+
+        A table like that of `ticks`: `time_s` is the start of a window, `rows` the number of its ticks, `state` the
+        state at its end, `mean_error_um` the mean of a signal.
+        """
+        level = self.level(window_s, start_s, end_s, names or tables.NAMES)
+        return streams.named_table(level, self.origin_utc)
+
+    def cycles(self, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
+        """The measured figure, one row per cycle: times, `z1_um` to `z36_um`, sag, quality, verdict."""
+        found = self.shapes()
+        wanted = (found.time_s >= start_s) & (found.time_s < end_s)
+        return streams.named_table(found.select(wanted).columns(), self.origin_utc)
 
     def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
-        """Telemetry in blocks of a few hours, so that a month needs no more memory than a night."""
+        """Telemetry as arrays, codes as numbers, in blocks of hours: a month needs no more memory than a night."""
         wanted = _with_time(names)
         table = yield from self._table_blocks(tables.TICKS, "mono_s", wanted, start_s, end_s)
         # a part that lies in a gap of the table, which the time after its end is not
@@ -133,7 +155,7 @@ class Run:
         end_s: float = np.inf,
         names: Sequence[str] = tables.NAMES,
     ) -> Block:
-        """Overview: minimum, mean and maximum of each signal in windows of 1, 10 or 60 s (`run_files.tables`).
+        """What `overview` shows, as arrays for computing: codes are numbers, absent values NaN.
 
         Windows missing from the level's table are computed from the next finer one, ultimately from the ticks.
         """
@@ -163,7 +185,7 @@ class Run:
         return [tables.first_level(block) for block in self.tick_blocks(tables.TICK_FIELDS, start_s, end_s)]
 
     def shapes(self) -> Shapes:
-        """Every shape estimate of the run."""
+        """Every shape estimate of the run, as arrays."""
         files = column_reader.column_files(self.folder, tables.SHAPES)
         parts = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
         found = [shapes.from_table(table) for table in parts if table.num_rows]
@@ -227,12 +249,12 @@ def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach
             return found, end.value
 
 
-def open_run(path: Path | str) -> Run:
+def open_run(path: str | Path) -> Run:
     """Open a run folder, even of a run that is in progress, was killed, or lacks parts.
 
     Parameters
     ----------
-    path : Path or str
+    path : str or Path
         Folder of the run, or a file in it.
 
     Raises

@@ -54,6 +54,12 @@ class Shapes:
         parts = {name: getattr(self, name)[wanted] for name in (*NUMBERS, "coeffs_um", "verdict")}
         return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
 
+    def columns(self) -> dict[str, Column | NDArray[np.str_]]:
+        """Columns of a table with one row per cycle: time, Z1..Z36, sag, quality, verdict."""
+        coeffs = {f"z{j}_um": np.ascontiguousarray(self.coeffs_um[:, j - 1]) for j in range(1, 37)}
+        numbers = {name: getattr(self, name) for name in NUMBERS}
+        return {"time_s": self.time_s} | coeffs | numbers | {"verdict": self.verdict}
+
     def heights_um(self, x: Column, y: Column) -> Column:
         """(n, points) height above the vertex at points of the unit disc (mirror radius 1), um."""
         return self.parameters_um() @ height_basis(x, y)

@@ -71,7 +71,8 @@ class LiveHold:
     Raises InputError if `run_dir` is not the folder of the client's run, or has no rings.
     """
 
-    def __init__(self, client: PortClient, run_dir: Path, take_over: bool = False) -> None:
+    def __init__(self, client: PortClient, run_dir: str | Path, take_over: bool = False) -> None:
+        run_dir = Path(run_dir)
         self._client, self._take_over = client, take_over
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")

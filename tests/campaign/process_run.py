@@ -134,7 +134,7 @@ def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
     if killed_utc_s is None:
         return gaps_s
     killed_s = killed_utc_s - run.utc(0.0).timestamp()
-    return gaps_s + max(0.0, killed_s - float(table.column("mono_s")[-1].as_py()) - 1.0 / RATE_HZ)
+    return gaps_s + max(0.0, killed_s - float(table.column("time_s")[-1].as_py()) - 1.0 / RATE_HZ)
 
 
 def utc_is_steady(run: Run) -> bool:

@@ -135,7 +135,7 @@ async def phases_of(run: Run, how: str, certificates: Path, port: int) -> list[P
 def judge(folder: Path, phases: list[Phase]) -> None:
     """Fill in how late the ticks of each phase were, as the control process has recorded it."""
     (run_folder,) = (path.parent for path in folder.glob("logs/*/summary.json"))
-    names = ["mono_s", "lateness_ms", "missed_ticks"]
+    names = ["time_s", "lateness_ms", "missed_ticks"]
     ticks = open_run(run_folder).ticks(names)
     time_s, late_ms, missed = (ticks.column(name).to_numpy() for name in names)
     for phase in phases:

@@ -48,7 +48,7 @@ def columns(folder: Path, name: str) -> dict[str, np.ndarray]:
 def errors(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Times and values of the settled ticks: by the laser, and of the true centre."""
     ticks = columns(folder, "ticks")
-    time_s = ticks["mono_s"]
+    time_s = ticks["time_s"]
     settled = time_s - time_s[0] >= SETTLED_AFTER_S
     series = {
         "reading": ticks["setpoint_um"] - ticks["displacement_um"],

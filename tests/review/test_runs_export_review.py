@@ -133,7 +133,7 @@ def test_export_of_some_streams_and_a_part(tmp_path: Path) -> None:
     files = export(run, "parquet", tmp_path / "o", ["/loop/error", "pump_fraction"], 10.0, 20.0)
     table = pyarrow.parquet.read_table(files[0])
     assert ([path.name for path in files], table.num_rows) == (["ticks.parquet"], 100)
-    assert table.column_names == ["mono_s", "error_um", "pump_fraction"]
+    assert table.column_names == ["time_s", "time_utc", "error_um", "pump_fraction"]
     with pytest.raises(InputError, match="/loop/eror"):
         export(run, "csv", tmp_path / "o", ["/loop/eror"])
     with pytest.raises(InputError, match="xls"):

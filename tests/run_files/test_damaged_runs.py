@@ -142,7 +142,7 @@ def test_the_batch_that_is_left_out_is_named_by_its_time_and_the_rest_is_there(s
     path = folder / "columns" / "ticks-000.arrows"
     path.write_bytes(_flipped(path.read_bytes(), path.stat().st_size // 2))
     run = open_run(folder)
-    time_s = run.ticks(["mono_s"]).column("mono_s").to_numpy()
+    time_s = run.ticks(["time_s"]).column("time_s").to_numpy()
     gap = int(np.argmax(np.diff(time_s)))
     note = next(note for note in run.notes if "ticks-000" in note)
     assert f"rows between {time_s[gap]:.2f} s and {time_s[gap + 1]:.2f} s are left out" in note
@@ -194,7 +194,7 @@ def test_the_last_file_of_a_table_is_missed_and_its_segment_stands_in(tmp_path: 
     ))  # fmt: skip
     (folder / "columns" / "ticks-001.arrows").unlink()
     run = open_run(folder)
-    assert np.allclose(run.ticks(["mono_s"]).column("mono_s"), np.concatenate((early, late))[:, 0])
+    assert np.allclose(run.ticks(["time_s"]).column("time_s"), np.concatenate((early, late))[:, 0])
     assert any("ticks-001.arrows: missing" in note for note in run.notes)
     assert any("Rerun segments replace ticks" in note for note in run.notes)
 

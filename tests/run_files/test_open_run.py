@@ -12,7 +12,7 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.telemetry import FIELDS, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.run_files.column_file import FILE_S
-from membrane_ctrl.run_files.tables import NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
+from membrane_ctrl.run_files.tables import CODES, NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
 from tests.support.review_runs import fields_recorded, same, segment, set_summary, tables, written
 
 
@@ -23,8 +23,8 @@ def level_of(rows: np.ndarray) -> dict[str, np.ndarray]:
 def test_every_field_comes_back(tmp_path: Path) -> None:
     rows, shapes = night(1, 0.1, "typical", [])
     table = open_run(written(tmp_path, 0.1)).ticks()
-    assert table.column_names == list(FIELDS)
-    for name in FIELDS:
+    assert table.column_names == ["time_s", "time_utc", *FIELDS[1:]]
+    for name in {*FIELDS[1:]} - {*CODES}:
         assert same(table.column(name).to_numpy(), column(rows, name), 1e-4), name
     back = open_run(tmp_path / "20261121T180000Z-night").shapes()
     np.testing.assert_allclose(back.coeffs_um, [shape.coeffs_um for shape in shapes])
@@ -33,8 +33,8 @@ def test_every_field_comes_back(tmp_path: Path) -> None:
 
 def test_a_part_of_a_run(tmp_path: Path) -> None:
     table = open_run(written(tmp_path, 0.1)).ticks(["error_um"], 100.0, 110.0)
-    time_s = table.column("mono_s").to_numpy()
-    assert table.column_names == ["mono_s", "error_um"]
+    time_s = table.column("time_s").to_numpy()
+    assert table.column_names == ["time_s", "time_utc", "error_um"]
     assert (time_s[0] >= 100, time_s[-1] < 110, table.num_rows) == (True, True, 100)
 
 
@@ -137,7 +137,7 @@ def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     run = open_run(folder)
     assert 2000 < run.ticks().num_rows < 6000
-    last_s = run.ticks(["mono_s"]).column("mono_s")[-1].as_py()
+    last_s = run.ticks(["time_s"]).column("time_s")[-1].as_py()
     assert any("ticks-000.arrows: truncated" in note and f"after {last_s:.2f} s" in note for note in run.notes)
 
 

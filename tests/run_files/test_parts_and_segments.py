@@ -50,7 +50,7 @@ def test_what_the_tables_have_is_not_read_from_segments(tmp_path: Path, reads: l
     run = open_run(folder)
     whole = run.ticks(["error_um"])
     part = run.ticks(["error_um"], 60.0, 120.0)
-    time_s = whole.column("mono_s").to_numpy()
+    time_s = whole.column("time_s").to_numpy()
     inside = (time_s >= 60) & (time_s < 120)
     assert same(part.column("error_um").to_numpy(), whole.column("error_um").to_numpy()[inside], 0.0)
     for window_s in (1.0, 10.0, 60.0):

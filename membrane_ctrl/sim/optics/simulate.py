@@ -116,13 +116,13 @@ class _Exposure:
     gain: float = 1.0
 
 
-def simulate_set(folder: Path, spec: SimulationSpec) -> None:
+def simulate_set(folder: str | Path, spec: SimulationSpec) -> None:
     """Write one capture set and its truth. Raises OSError if the folder or a file cannot be written."""
-    _write_set(folder, spec, _renderer(spec))
+    _write_set(Path(folder), spec, _renderer(spec))
 
 
 def simulate_run(
-    folder: Path,
+    folder: str | Path,
     spec: SimulationSpec,
     sets: int,
     interval_s: float = 4.0,
@@ -150,7 +150,7 @@ def simulate_run(
         else:
             start_s, seed = spec.start_s + number * interval_s, spec.seed + number
             this = replace(spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=())
-        _write_set(folder / f"{number:04d}", this, renderer)
+        _write_set(Path(folder) / f"{number:04d}", this, renderer)
         if on_set is not None:
             on_set(number + 1)
 
