@@ -27,4 +27,4 @@ def test_the_notebook_runs(
     said = capsys.readouterr().out
     assert "600 ticks" in said
     assert "180 cycles" in said
-    assert "pressure step: 2" in said
+    assert "found: pressure step, 2" in said
