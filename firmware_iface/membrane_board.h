@@ -7,27 +7,27 @@
 #define MEMBRANE_DEVICE_KIND 0x4D42u
 #define MEMBRANE_I32_NO_VALUE (-2147483647 - 1) /* there is no value */
 
-/* identity (ro): Who answers, and the limits the board keeps by itself. */
+/* identity (ro): Identity, and the limits that the board itself enforces. */
 #define MEMBRANE_BLOCK_IDENTITY_ADDRESS 0u
 #define MEMBRANE_BLOCK_IDENTITY_WORDS 7u
 #define MEMBRANE_DEVICE_KIND_ADDRESS 0u /* u16: 19778 (0x4D42): a membrane pump board */
 #define MEMBRANE_MAP_VERSION_ADDRESS 1u /* u16: version of this map; a controller refuses one it does not know */
 #define MEMBRANE_FIRMWARE_VERSION_ADDRESS 2u /* u32: major * 65536 + minor * 256 + patch */
-#define MEMBRANE_GAUGE_PRESSURE_LIMIT_PA_ADDRESS 4u /* f32: above it the board shuts the pump and opens the vent by itself */
-#define MEMBRANE_PUMP_LIMIT_FRACTION_ADDRESS 6u /* u16: highest output the board gives to the pump, whatever is commanded */
+#define MEMBRANE_GAUGE_PRESSURE_LIMIT_PA_ADDRESS 4u /* f32: above it the board itself stops the pump and opens the vent */
+#define MEMBRANE_PUMP_LIMIT_FRACTION_ADDRESS 6u /* u16: highest drive that the board gives to the pump, whatever the command */
 #define MEMBRANE_PUMP_LIMIT_FRACTION_COUNTS_PER_UNIT 50000
 
 /* sensors (ro): One consistent sample and the state of the board: read it whole, once a tick. */
 #define MEMBRANE_BLOCK_SENSORS_ADDRESS 16u
 #define MEMBRANE_BLOCK_SENSORS_WORDS 25u
-#define MEMBRANE_SAMPLE_COUNTER_ADDRESS 16u /* u32: counts samples, wraps; standing still means a frozen board */
+#define MEMBRANE_SAMPLE_COUNTER_ADDRESS 16u /* u32: counts samples, wraps; a constant value means a frozen board */
 #define MEMBRANE_DEVICE_TIME_S_ADDRESS 18u /* u32: whole seconds since power-up at the sample */
 #define MEMBRANE_DEVICE_TIME_FRACTION_S_ADDRESS 20u /* u16: fraction of a second to add to device_time_s */
 #define MEMBRANE_DEVICE_TIME_FRACTION_S_COUNTS_PER_UNIT 10000
 #define MEMBRANE_DISPLACEMENT_QUALITY_ADDRESS 21u /* u16: 0 good, else the laser's error code */
 #define MEMBRANE_DISPLACEMENT_UM_ADDRESS 22u /* i32: laser reading, positive when the bowl deepens; its zero is arbitrary */
 #define MEMBRANE_DISPLACEMENT_UM_COUNTS_PER_UNIT 1000
-#define MEMBRANE_GAUGE_PRESSURE_PA_ADDRESS 24u /* i32: gas between the films against the room */
+#define MEMBRANE_GAUGE_PRESSURE_PA_ADDRESS 24u /* i32: gas between the films, relative to the room */
 #define MEMBRANE_GAUGE_PRESSURE_PA_COUNTS_PER_UNIT 1000
 #define MEMBRANE_AMBIENT_PRESSURE_PA_ADDRESS 26u /* i32: barometer */
 #define MEMBRANE_AMBIENT_PRESSURE_PA_COUNTS_PER_UNIT 1000
@@ -35,9 +35,9 @@
 #define MEMBRANE_AIR_TEMPERATURE_C_COUNTS_PER_UNIT 10000
 #define MEMBRANE_GAS_TEMPERATURE_C_ADDRESS 30u /* i32: gas between the films */
 #define MEMBRANE_GAS_TEMPERATURE_C_COUNTS_PER_UNIT 10000
-#define MEMBRANE_PUMP_READBACK_FRACTION_ADDRESS 32u /* u16: what the pump is given now */
+#define MEMBRANE_PUMP_READBACK_FRACTION_ADDRESS 32u /* u16: present drive of the pump */
 #define MEMBRANE_PUMP_READBACK_FRACTION_COUNTS_PER_UNIT 50000
-#define MEMBRANE_VENT_READBACK_FRACTION_ADDRESS 33u /* u16: how far the vent is open now */
+#define MEMBRANE_VENT_READBACK_FRACTION_ADDRESS 33u /* u16: present opening of the vent */
 #define MEMBRANE_VENT_READBACK_FRACTION_COUNTS_PER_UNIT 50000
 #define MEMBRANE_HEARTBEAT_ECHO_ADDRESS 34u /* u16: the last heartbeat that fed the watchdog */
 #define MEMBRANE_WATCHDOG_ARMED_ADDRESS 35u /* u16: 1 armed; 0 after power-up */
@@ -45,7 +45,7 @@
 #define MEMBRANE_LATCHED_FAULTS_ADDRESS 37u /* u16: fault bits; the pump stays off while one is set */
 #define MEMBRANE_PERIOD_IN_FORCE_S_ADDRESS 38u /* u16: watchdog period now */
 #define MEMBRANE_PERIOD_IN_FORCE_S_COUNTS_PER_UNIT 1000
-#define MEMBRANE_CLAIM_IN_FORCE_ADDRESS 39u /* u32: claim_id of whoever holds or last held the board; 0: nobody */
+#define MEMBRANE_CLAIM_IN_FORCE_ADDRESS 39u /* u32: claim_id of the present or last holder of the board; 0: none */
 
 /* settings (rw): Lost at power-down. From map version 2 on, arming claims the board; written whole or not at all. */
 #define MEMBRANE_BLOCK_SETTINGS_ADDRESS 48u
@@ -57,7 +57,7 @@
 #define MEMBRANE_WATCHDOG_ARM_ADDRESS 49u /* u16: 1 arms (arming again does not feed); 0 disarms, refused while the pump command is above 0 */
 #define MEMBRANE_WATCHDOG_ARM_MIN_RAW 0
 #define MEMBRANE_WATCHDOG_ARM_MAX_RAW 1
-#define MEMBRANE_CLAIM_ID_ADDRESS 50u /* u32: random name of the claim; everybody may read it */
+#define MEMBRANE_CLAIM_ID_ADDRESS 50u /* u32: random public name of the claim */
 #define MEMBRANE_CLAIM_ID_MIN_RAW 1
 #define MEMBRANE_CLAIM_ID_MAX_RAW 4294967295
 #define MEMBRANE_CLAIM_KEY_ADDRESS 52u /* u32: random secret of the claim; reads as 0 */
@@ -82,7 +82,7 @@
 #define MEMBRANE_COMMAND_KEY_MIN_RAW 1
 #define MEMBRANE_COMMAND_KEY_MAX_RAW 4294967295
 
-/* reset (rw): Clearing is a person's decision; no driver does it by itself. */
+/* reset (rw): A person decides to clear; no driver does it by itself. */
 #define MEMBRANE_BLOCK_RESET_ADDRESS 64u
 #define MEMBRANE_BLOCK_RESET_WORDS 3u
 #define MEMBRANE_CLEAR_FAULTS_ADDRESS 64u /* u16: fault bits to clear; also sets the pump command to 0; reads as 0 */
@@ -92,7 +92,7 @@
 #define MEMBRANE_CLEAR_KEY_MIN_RAW 1
 #define MEMBRANE_CLEAR_KEY_MAX_RAW 4294967295
 
-/* stop (rw): Anybody may stop the pump; it needs no claim. */
+/* stop (rw): Any program may stop the pump without a claim. */
 #define MEMBRANE_BLOCK_STOP_ADDRESS 72u
 #define MEMBRANE_BLOCK_STOP_WORDS 1u
 #define MEMBRANE_STOP_ADDRESS 72u /* u16: 1 latches the fault `stopped`; reads as 0 */
@@ -102,6 +102,6 @@
 /* bits of latched_faults and clear_faults */
 #define MEMBRANE_FAULT_WATCHDOG 0x0001u /* no write of the whole command block with a new heartbeat within the period: pump off, vent as it was */
 #define MEMBRANE_FAULT_OVER_PRESSURE 0x0002u /* gauge pressure above gauge_pressure_limit_pa: pump off, vent open */
-#define MEMBRANE_FAULT_STOPPED 0x0004u /* somebody wrote `stop`: pump off, vent as it was */
+#define MEMBRANE_FAULT_STOPPED 0x0004u /* a program wrote `stop`: pump off, vent as it was */
 
 #endif
