@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test rest lint types kernels fast real_time unit shake docs bench campaign fuzz mutants generate clean
+.PHONY: hold test rest lint types kernels fast real_time unit shake docs pictures bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -53,6 +53,9 @@ unit: fast real_time
 
 shake: $(STAMP)  ## the same tests on a machine that pauses for a second, again and again; SEED=2 for other moments
 	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
+
+pictures: $(STAMP)  ## the pictures of README and documentation, taken anew; ONLY='run-*' for some of them
+	$(BIN)/python -m tests.support.pictures $(ONLY)
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks

@@ -119,7 +119,8 @@ def _end_event(clock: RunClock, exit_word: str) -> EventLine:
 # Small pictures of camera frames, now and then.
 
 
-# Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.3 GB.
+# Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.2 GB (no video:
+# docs/recording.md).
 THUMBNAIL_INTERVAL_S = 30.0
 THUMBNAIL_HEIGHT_PX = 256
 _JPEG_QUALITY = 80

@@ -77,6 +77,9 @@ class QuietFilter:
         return quiet
 
 
+_BAND_EVERY_S = 5.0
+
+
 class TelemetryStreams:
     """Sends rows to a recording; remembers the codes of the last row."""
 
@@ -86,12 +89,12 @@ class TelemetryStreams:
         self._band = streams.band(self._band_um)
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
         self._codes: dict[str, float] = {}
-        self._banded = False
+        self._band_s = math.nan  # end of the band so far
 
     def start_segment(self) -> None:
         """Restart lanes and band: a new file does not know the last state of the previous one."""
         self._codes.clear()
-        self._banded = False
+        self._band_s = math.nan
 
     def send(self, rows: telemetry.Rows) -> None:
         """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
@@ -102,12 +105,13 @@ class TelemetryStreams:
         self._send_lanes(rows)
 
     def _send_overview(self, rows: telemetry.Rows) -> None:
-        """Send one row for all of these, at the middle; the band to their end."""
+        """Send one row for all of these, at the middle; now and then the band up to their end."""
         time_s = telemetry.column(rows, "mono_s")
-        edge_s = time_s[-1:] if self._banded else time_s[[0, -1]]
-        self._banded = True
-        square = np.full((len(edge_s), 1), self._band_um**2)
-        self._recording.measurements(self._band.path, edge_s, np.zeros_like(square), square)
+        if not time_s[-1] - self._band_s < _BAND_EVERY_S:
+            edge_s = time_s[[0, -1]] if math.isnan(self._band_s) else time_s[-1:]
+            self._band_s = float(time_s[-1])
+            square = np.full((len(edge_s), 1), self._band_um**2)
+            self._recording.measurements(self._band.path, edge_s, np.zeros_like(square), square)
         mean = streams.mean_row(rows)
         true_um = telemetry.true_error_um(telemetry.columns(mean))
         blocks = [(stream.path, stream.values(mean)) for stream in streams.MEANS]
@@ -198,8 +202,6 @@ class ShapeStreams:
         self._recording.scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
         for stream, (values, variances) in _changes(estimate, self.reference).items():
             self._recording.measurements(stream.path, time_s, np.array([values]), np.array([variances]))
-        change_um = (estimate.coeffs_um - self.reference.coeffs_um)[1:]
-        self._recording.log(shapes.BARS_PATH, estimate.time_s, rr.BarChart.from_fields(values=change_um))
         if self.pictures:
             self._send_maps(estimate, self.reference)
 
@@ -215,8 +217,9 @@ class ShapeStreams:
             self._next_difference_s = time_s + (DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S)
             difference_um = shapes.difference_map_um(estimate, reference)
             for kind, (terms, least_um) in _CHANGES.items():
-                change_um = shapes.without_terms(difference_um, terms)
-                self._send_map(kind, "µm", time_s, change_um, least_um)
+                self._send_map(kind, "µm", time_s, shapes.without_terms(difference_um, terms), least_um)
+            terms_um = (estimate.coeffs_um - reference.coeffs_um)[1:]
+            self._recording.log(shapes.BARS_PATH, time_s, rr.BarChart.from_fields(values=terms_um))
             self._recording.page("/shape/legend", time_s, _legend(estimate, reference, self._colours))
 
     def _send_map(

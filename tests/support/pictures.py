@@ -1,0 +1,128 @@
+"""The pictures of README and documentation, taken anew: `make pictures`, or `python -m tests.support.pictures run-*`.
+
+Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for the report, Chromium. Each picture
+is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails, sets
+of a screen bowed by 1 mm.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.nights import DOOR, GLITCH, JUMP, LEAK, Planted
+from firmware_iface.roles import BenchReading
+from membrane_ctrl.review.viewer.viewer import screenshot
+from tests.support.review_runs import written
+from tests.support.virtual_record import kept_ticks, write_record
+
+IMAGES = Path(__file__).parents[2] / "docs" / "images"
+_WIDTH_PX = 1280  # of a tab of the review, beside others on its page
+
+
+def command(*arguments: object) -> None:
+    """Run a command of the product; its output is on the terminal."""
+    subprocess.run([sys.executable, "-m", "membrane_ctrl", *map(str, arguments)], check=True)
+
+
+def run_pictures(folder: Path) -> dict[str, bytes]:
+    """The recording of a hold as it opens, and its shapes."""
+    command("hold", "--twin", "--duration", "5m", "--name", "run", "--logs", folder)
+    run = next(folder.glob("*-run"))
+    return {"run-overview": screenshot(run), "run-shape": screenshot(run, "Shape")}
+
+
+def review_pictures(folder: Path) -> dict[str, bytes]:
+    """The tabs of a night's review, and its report."""
+    events = [Planted(DOOR, 2500.0, 20.0), Planted(LEAK, 4700.0, 60.0), Planted(GLITCH, 7000.0, 30.0),
+              Planted(JUMP, 9000.0, 3.0)]  # fmt: skip
+    night = written(folder, 3.0, events)
+    found = {f"review-{tab}": _tab(night, tab) for tab in ("overview", "shape")}
+    parts = {"loop": ("--at", "+2500s"), "tuning": ("--from", "+30m", "--to", "+35m")}
+    found |= {f"review-{tab}": _tab(night, tab, *part) for tab, part in parts.items()}
+    command("report", night, "--out", folder / "report")
+    return found | {"report": _page(folder / "report" / "report.html", 800, 3082)}
+
+
+def faults_picture(folder: Path) -> dict[str, bytes]:
+    """The review of a hold whose laser fails three times, at last for good."""
+
+    def blind(now_s: float, reading: BenchReading) -> BenchReading:
+        dark = 200.0 <= now_s < 201.0 or 400.0 <= now_s < 406.0 or now_s >= 700.0
+        return replace(reading, displacement_um=np.nan, displacement_quality=1) if dark else reading
+
+    run = folder / "20261121T180000Z-faults"
+    run.mkdir()
+    write_record(run, kept_ticks(900.0, blind))
+    return {"review-faults": _tab(run, "faults")}
+
+
+def bowed_picture(folder: Path) -> dict[str, bytes]:
+    """Residuals of the calibration of a bowed screen, stated as flat."""
+    bowed, flat = folder / "bowed.toml", folder / "flat.toml"
+    numbers = "a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
+    bowed.write_text(f"[optics.geometry]\n{numbers}[optics.geometry.screen]\nbow_mm = 1.0\n")
+    flat.write_text(f"[geometry]\n{numbers}")
+    sets = [folder / f"set{place}" for place in range(4)]
+    for place, capture in enumerate(sets):
+        command("simulate", capture, "--config", bowed, "--stated", flat, "--shrink", 4, "--displacement-um",
+                -2000 * place, "--seed", 1 + place)  # fmt: skip
+    out = folder / "geometry.toml"
+    refused = subprocess.run([sys.executable, "-m", "membrane_ctrl", "calibrate", *sets, "--out", out], check=False)
+    assert refused.returncode == 3
+    return {"calibration-bowed-screen": (folder / "geometry-residuals.png").read_bytes()}
+
+
+def _tab(run: Path, tab: str, *part: str) -> bytes:
+    target = run.parent / f"{tab}.png"
+    command("review", run, "--tab", tab, *part, "--screenshot", target)
+    picture = cv2.imread(str(target))
+    height_px = round(picture.shape[0] * _WIDTH_PX / picture.shape[1])
+    return cv2.imencode(".png", cv2.resize(picture, (_WIDTH_PX, height_px), interpolation=cv2.INTER_AREA))[
+        1
+    ].tobytes()
+
+
+def _page(page: Path, width_px: int, height_px: int) -> bytes:
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        sys.exit("no Chromium: apt-get install chromium")
+    target = page.with_suffix(".png")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width_px},{height_px}",
+               f"--user-data-dir={page.parent / 'profile'}", f"--screenshot={target}"]  # fmt: skip
+    subprocess.run([chromium, *options, page.as_uri()], check=True, capture_output=True, timeout=120)
+    return target.read_bytes()
+
+
+MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
+    ("run-overview", "run-shape"): run_pictures,
+    ("review-overview", "review-loop", "review-shape", "review-tuning", "report"): review_pictures,
+    ("review-faults",): faults_picture,
+    ("calibration-bowed-screen",): bowed_picture,
+}
+
+
+def main() -> None:
+    """Write the pictures whose names match the arguments; without any, all."""
+    wanted = sys.argv[1:] or ["*"]
+    for names, make in MAKERS.items():
+        chosen = [name for name in names if any(fnmatch(name, pattern) for pattern in wanted)]
+        if chosen:
+            with tempfile.TemporaryDirectory() as folder:
+                made = make(Path(folder))
+            for name in chosen:
+                (IMAGES / f"{name}.png").write_bytes(made[name])
+                print(IMAGES / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
