@@ -90,6 +90,7 @@ class TelemetryStreams:
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
         self._codes: dict[str, float] = {}
         self._band_s = math.nan  # end of the band so far
+        self._rest = np.empty((0, len(telemetry.FIELDS)))  # rows of a second that is not over
 
     def start_segment(self) -> None:
         """Restart lanes and band: a new file does not know the last state of the previous one."""
@@ -105,24 +106,28 @@ class TelemetryStreams:
         self._send_lanes(rows)
 
     def _send_overview(self, rows: telemetry.Rows) -> None:
-        """Send one row for all of these, at the middle; now and then the band up to their end."""
+        """Send a row for each second that is over; now and then the band up to the last row."""
         time_s = telemetry.column(rows, "mono_s")
         if not time_s[-1] - self._band_s < _BAND_EVERY_S:
             edge_s = time_s[[0, -1]] if math.isnan(self._band_s) else time_s[-1:]
             self._band_s = float(time_s[-1])
             square = np.full((len(edge_s), 1), self._band_um**2)
             self._recording.measurements(self._band.path, edge_s, np.zeros_like(square), square)
-        mean = streams.mean_row(rows)
-        true_um = telemetry.true_error_um(telemetry.columns(mean))
-        blocks = [(stream.path, stream.values(mean)) for stream in streams.MEANS]
-        blocks += [
-            (streams.OVERVIEW.path, streams.overview_um(rows)),
-            (streams.TRUE_MEAN.path, true_um[:, np.newaxis]),
-        ]
-        middle = len(rows) // 2
+        rows = np.concatenate((self._rest, rows))
+        second = np.floor(telemetry.column(rows, "mono_s"))
+        starts = np.flatnonzero(np.diff(second, prepend=-1.0))
+        *whole, self._rest = np.split(rows, starts[1:])
+        if not whole:
+            return
+        means = np.concatenate([streams.mean_row(part) for part in whole])
+        errors_um = np.concatenate([streams.overview_um(part) for part in whole])
+        true_um = telemetry.true_error_um(telemetry.columns(means))[:, np.newaxis]
+        blocks = [(stream.path, stream.values(means)) for stream in streams.MEANS]
+        blocks += [(streams.OVERVIEW.path, errors_um), (streams.TRUE_MEAN.path, true_um)]
         for path, values in blocks:
-            if np.isfinite(values).any():
-                self._recording.scalars(path, time_s[middle : middle + 1], values)
+            there = np.isfinite(values).any(axis=1)
+            if there.any():
+                self._recording.scalars(path, telemetry.column(means, "mono_s")[there], values[there])
 
     def _send_streams(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.column(rows, "mono_s")

@@ -15,7 +15,7 @@ from membrane_ctrl.model.telemetry import COLUMN, FIELDS, changes, column, unpac
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
 from membrane_ctrl.recorder.blueprint import FAULT, STATE
 from membrane_ctrl.recorder.process import THUMBNAIL_INTERVAL_S, Thumbnails
-from membrane_ctrl.recorder.rerun_streams import ShapeStreams
+from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.run_files.rrd_reader import read_shapes
 from membrane_ctrl.run_files.streams import (
@@ -27,7 +27,7 @@ from membrane_ctrl.run_files.streams import (
     mean_row,
     overview_um,
 )  # fmt: skip
-from tests.support.rrd_reading import entities
+from tests.support.rrd_reading import entities, scalars
 from tests.support.synthetic_run import rows_of, shape_of
 
 
@@ -70,6 +70,22 @@ def test_means_are_of_what_is_there() -> None:
     assert column(mean, "pump_fraction") == pytest.approx([0.3])
     assert column(mean, "mono_s") == pytest.approx([0.04])
     assert np.isnan(column(mean, "gas_temperature_c")).all()
+
+
+@pytest.mark.parametrize("block", [37, 50, 430])
+def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> None:
+    rows = unpack([row.pack() for row in rows_of(20.0)])
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    telemetry = TelemetryStreams(recording, Config())
+    for first in range(0, len(rows), block):
+        telemetry.send(rows[first : first + block])
+    recording.close()
+    seconds = rows[: 19 * 50].reshape(19, 50, -1)  # the last one may go on
+    for path, field in (("/overview/error", "error_um"), ("/overview/loop/flow", "flow_um_per_s")):
+        time_s, values = scalars(tmp_path / "test-000.rrd", path)
+        assert time_s == pytest.approx(np.arange(19) + 0.49), path
+        assert values[:, 1] == pytest.approx(seconds[:, :, COLUMN[field]].mean(axis=1)), path
 
 
 def test_lines_are_vertical_and_of_their_kind() -> None:
