@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from membrane_ctrl.model.clock import parse_duration_s
+from membrane_ctrl.model import clock, errors
 
 if TYPE_CHECKING:
     from tuning.command import TuneOptions
@@ -71,13 +71,12 @@ def _step(name: str) -> None:
         choose: ChooseOption = "",
         json: JsonOption = False,
     ) -> int:
-        from membrane_ctrl.config.schema import Config
-        from membrane_ctrl.config.toml_file import load
+        from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
         from tuning import command as tune
 
         options = tune.TuneOptions(
-            config=Config() if config is None else load(config, Config),
+            config=schema.Config() if config is None else toml_file.load(config, schema.Config),
             twin=twin,
             where=Where(socket, run, logs=logs),
             logs=logs,
@@ -86,8 +85,8 @@ def _step(name: str) -> None:
             author=author or tune.author_name(),
             reason=reason,
             limit_um=limit_um,
-            observe_s=parse_duration_s(observe),
-            verify_s=parse_duration_s(verify),
+            observe_s=clock.parse_duration_s(observe),
+            verify_s=clock.parse_duration_s(verify),
             take_over=take_over,
             yes=yes,
             choose=choose,
@@ -153,3 +152,20 @@ def compare(
 
     print(compared(open_session(a), open_session(b)))
     return 0
+
+
+@app.command()
+def explore(
+    folder: Annotated[Path, typer.Argument(metavar="RUN|SESSION", help="Run or session folder.")],
+    logs: LogsOption = Path("logs"),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on localhost; a free one by default.")] = 0,
+    author: AuthorOption = None,
+) -> int:
+    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather."""
+    from tuning.command import author_name
+
+    try:
+        from tuning.explore.page import explore
+    except ModuleNotFoundError:
+        raise errors.InputError("tune explore needs Bokeh: pip install 'membrane-ctrl[web]'") from None
+    return explore(folder, logs, port, author or author_name())

@@ -24,7 +24,7 @@ from membrane_ctrl.control.filters import smoothing
 from tuning.identification import loop_model, records
 
 # Slower motion does not matter to the loop, and weather is no longer a random walk.
-_SLOWEST_S = 100.0
+SLOWEST_S = 100.0
 _FLOOR = 1e-12  # um^2: stands for a zero intensity
 _LARGEST = 1e9  # um^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
@@ -70,8 +70,8 @@ def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
     Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the lag of the slow
     walk; 0 omits it.
     """
-    if series.size * dt_s < 2 * _SLOWEST_S:
-        raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * _SLOWEST_S:.0f} s at least")
+    if series.size * dt_s < 2 * SLOWEST_S:
+        raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * SLOWEST_S:.0f} s at least")
     w, power = _periodogram(np.diff(series), dt_s)
     shapes = [np.abs(1 - np.exp(-1j * w * dt_s)) ** 2, np.full(w.size, dt_s)]
     if slow_s > 0:
@@ -102,7 +102,7 @@ def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Serie
     taper /= math.sqrt(float(taper @ taper))
     power = np.abs(np.fft.rfft((increments - increments.mean()) * taper)) ** 2
     w = 2 * np.pi * np.fft.rfftfreq(increments.size, dt_s)
-    used = slice(int(np.searchsorted(w, 2 * np.pi / _SLOWEST_S)), w.size - 1)
+    used = slice(int(np.searchsorted(w, 2 * np.pi / SLOWEST_S)), w.size - 1)
     return np.asarray(w[used], dtype=float), np.asarray(power[used], dtype=float)
 
 
