@@ -30,7 +30,19 @@ LIST = Path(__file__).with_name("mutants.toml")
 DOCUMENT = ROOT / "docs" / "mutants.md"
 PRODUCT = ("membrane_ctrl", "firmware_iface")
 # after the tests that an area names: all fast tests of control and devices
-ALL_FAST = ("tests/test_*.py", "tests/virtual/test_*.py", "tests/control/test_*.py", "tests/firmware_iface/test_*.py")
+ALL_FAST = tuple(
+    f"tests/{room}/test_*.py"
+    for room in (
+        "controller",
+        "control",
+        "hold",
+        "firmware_iface",
+        "instruments",
+        "control_port",
+        "commissioning",
+        "sim",
+    )
+)
 # These compare a generated document with its source: any change of the source would count as noticed ...
 COMPARISONS = ("test_faults_page.py", "test_register_generate.py")
 # ... and this one waits for real devices' time-outs: on a busy machine it fails without a mutation.

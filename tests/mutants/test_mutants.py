@@ -37,3 +37,7 @@ def test_the_committed_document_reaches_the_goals() -> None:
     assert total >= 80
     assert tests >= TESTS_GOAL * total
     assert campaign >= CAMPAIGN_GOAL * total
+
+
+def test_the_fast_tests_that_are_asked_exist() -> None:
+    assert all(list(ROOT.glob(pattern)) for pattern in mutants.ALL_FAST)
