@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
-from membrane_ctrl.config.schema import Config, GeometryConfig, LoopConfig
+from membrane_ctrl.config import sight
+from membrane_ctrl.config.schema import Config, LoopConfig, OpticsConfig
 from membrane_ctrl.control import film, gas, inner_loop
 from membrane_ctrl.controller import pump_obeys, safety
 
@@ -16,7 +17,6 @@ _MS_MOST, _MS_WARN = 3.0, 1.8  # peak sensitivity: 3 leaves a phase margin of 19
 _BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
 _FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is worse than none
 _VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
-_GRAZING_DEG = 10.0
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
 # Differences between an honest laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
@@ -155,26 +155,25 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
 
 
 def judge_optics(config: Config, say: ConfigFindings) -> None:
-    _geometry("optics.geometry", config.optics.geometry, config.optics.mirror.radius_mm, say)
+    camera = config.devices is not None and config.devices.camera is not None
+    _geometry("optics.geometry", config.optics, config.shape.enabled or camera, say)
     if config.twin.geometry is not None:
-        _geometry("twin.geometry", config.twin.geometry, config.optics.mirror.radius_mm, say)
+        true = config.optics.model_copy(update={"geometry": config.twin.geometry})
+        _geometry("twin.geometry", true, config.shape.enabled, say)
 
 
-def _geometry(field: str, geometry: GeometryConfig, radius_mm: float, say: ConfigFindings) -> None:
-    if geometry.alpha_deg is not None:
-        grazing = min(geometry.alpha_deg, 180.0 - geometry.alpha_deg) < _GRAZING_DEG
-        degrees = math.degrees(geometry.alpha_deg)
-        hint = f"as radians it is {degrees:.1f} deg" if degrees < 180.0 else "measure it from the mirror's plane"
-        say.error(grazing, f"{field}.alpha_deg", "camera and screen would look along the mirror", hint)
-        for name in ("a", "b"):
-            length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
-            say.warn(length_mm < radius_mm, f"{field}.{name}_mm", "less than the mirror's radius", "in mm?")
-            wide = sigma_mm is not None and sigma_mm > 0.1 * length_mm
-            say.warn(wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again")
-    if geometry.camera is not None:
-        behind = geometry.camera.position_mm[2] <= 0.0
+def _geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings) -> None:
+    geometry = optics.geometry
+    for name in ("a", "b"):
+        length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
+        wide = length_mm is not None and sigma_mm is not None and sigma_mm > 0.1 * length_mm
+        say.warn(wide, f"{field}.{name}_sigma_mm", "a tenth of the length or more", "measure again")
+    if geometry.camera is not None and geometry.camera.position_mm[2] <= 0.0:
         why = "the camera is behind the mirror"
-        say.error(behind, f"{field}.camera.position_mm", why, "z points out of the mirror")
+        say.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")
+    elif used and (found := sight.doubt(optics)):
+        say.error(found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
+        say.warn(not found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
 
 
 def judge_alarms(config: Config, say: ConfigFindings) -> None:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import tomli_w
 
 from firmware_iface.settings import Section
-from membrane_ctrl.config import toml_file
+from membrane_ctrl.config import sight, toml_file
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
 from membrane_ctrl.model import errors, files, plain_json
 
@@ -168,7 +168,10 @@ def geometry_in_force(config: Config) -> InForce:
 
     Raises InputError if the file exists but cannot be used.
     """
-    return _read(config.optics.geometry_file, config)
+    there = _read(config.optics.geometry_file, config)
+    if there.origin.file:
+        require_plausible(there.optics, Path(there.origin.file))
+    return there
 
 
 def geometry_of_run(run_dir: Path | None, config: Config) -> InForce:
@@ -184,3 +187,10 @@ def _read(path: Path | None, config: Config) -> InForce:
         return InForce(optics, origin_of(optics), note=note)
     file = read_geometry(path)
     return InForce(file.over(optics), file.origin, file.calibration, file.text)
+
+
+def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = True) -> None:
+    """Raises InputError for a geometry from `where` with which less than half of the mirror can be measured."""
+    found = sight.doubt(optics, depth_known)
+    if found is not None and found.hopeless:
+        raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")

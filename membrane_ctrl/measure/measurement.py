@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.geometry.file import GeometryFile
+from membrane_ctrl.geometry.file import GeometryFile, require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frames import frame_stack, integrity
@@ -77,6 +77,8 @@ def measure_set(
     """
     begin = time.perf_counter()
     capture = read_set(folder, geometry)
+    where = folder / "capture.toml" if geometry is None else geometry.path
+    require_plausible(capture.head.optics, where, depth_known=False)  # the set need not know its film's depth
     if capture.head.reference is not None:
         reference, own = read_anchor(capture.head.reference, geometry)
         anchor = anchor or own

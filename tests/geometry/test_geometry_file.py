@@ -127,6 +127,13 @@ def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> No
     assert geometry_in_force(Config()).note == ""
 
 
+def test_a_file_with_which_the_mirror_cannot_be_measured_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "g.toml"
+    path.write_text("a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 30.0\n")
+    with pytest.raises(InputError, match=r"g\.toml: geometry\.alpha_deg: the pattern .* in 28% of the mirror"):
+        geometry_in_force(Config(optics=OpticsConfig(geometry_file=path)))
+
+
 def test_a_file_that_cannot_be_used_is_no_missing_one(tmp_path: Path) -> None:
     (tmp_path / "g.toml").write_text("[geometry]\na_mm = 3\n")
     with pytest.raises(InputError, match=r"g\.toml: a_mm"):

@@ -208,6 +208,20 @@ def test_another_geometry(made: Path, tmp_path: Path) -> None:
     assert other["zernike"]["coeffs_um"][3] != pytest.approx(own["zernike"]["coeffs_um"][3], abs=1.0)
 
 
+@pytest.mark.parametrize("alpha_deg", [30.0, 1.41])
+def test_a_geometry_that_cannot_be_is_refused_with_the_file_that_states_it(
+    capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], alpha_deg: float
+) -> None:
+    file = tmp_path / "geometry.toml"
+    file.write_text(f"[geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = {alpha_deg}\n")
+    assert run(["measure", str(capture_set), "--geometry", str(file)]) == 2
+    assert capsys.readouterr().err.startswith(f"membrane-ctrl: {file}: geometry.alpha_deg: the pattern (")
+    rewrite(capture_set, lambda t: t["geometry"].update(alpha_deg=alpha_deg))
+    assert run(["measure", str(capture_set)]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"membrane-ctrl: {capture_set / 'capture.toml'}: geometry.alpha_deg: the pattern (")
+
+
 def test_unknown_keys_are_said_and_ignored(
     capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,14 +5,14 @@ roll, image down is world -y, forward is -F / a, and image right is the unit vec
 +x: (sin alpha, 0, -cos alpha).
 """
 
-import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.config.sight import poses
 from membrane_ctrl.metrology.optics.screen_face import Face
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
@@ -37,7 +37,7 @@ class Geometry:
     def from_config(cls, optics: OpticsConfig) -> "Geometry":
         """The geometry a configuration describes."""
         camera = optics.camera
-        pinhole, rotation, origin, s_x, s_y = _poses(optics.geometry)
+        pinhole, rotation, origin, s_x, s_y = poses(optics.geometry)
         return cls(
             pinhole_mm=pinhole,
             rotation=rotation,
@@ -71,26 +71,6 @@ class Geometry:
         origin = self.screen_origin_mm.reshape(3, *[1] * (screen_mm.ndim - 1))
         in_screen = np.concatenate([screen_mm, self.face.heights(screen_mm)[:1]])
         return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
-
-
-def _poses(config: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pinhole, rotation, O', s_x, s_y in world from either form."""
-    screen = None if config.screen is None else config.screen.pose
-    if config.camera is not None and screen is not None:
-        general = (config.camera.position_mm, config.camera.rotation, *screen)
-        pinhole, rotation, origin, s_x, s_y = (np.array(value, float) for value in general)
-        return pinhole, rotation, origin, s_x, s_y
-    if config.a_mm is None or config.b_mm is None or config.alpha_deg is None:
-        raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
-    cosine, sine = math.cos(math.radians(config.alpha_deg)), math.sin(math.radians(config.alpha_deg))
-    rotation = np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]])
-    return (
-        config.a_mm * np.array([cosine, 0.0, sine]),
-        rotation,
-        config.b_mm * np.array([-cosine, 0.0, sine]),
-        np.array([-sine, 0.0, -cosine]),
-        np.array([0.0, 1.0, 0.0]),
-    )
 
 
 def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
