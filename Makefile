@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test rest lint types kernels fast real_time unit shake docs pictures bench campaign fuzz mutants generate clean
+.PHONY: hold test rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -74,6 +74,9 @@ fuzz: $(STAMP)  ## mutated run folders and capture sets through every command th
 generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
 	$(BIN)/python -m firmware_iface.generate
 	$(BIN)/python -m tests.support.faults_page
+
+notebooks: $(STAMP)  ## runs docs/notebooks and stores what they print and draw
+	$(BIN)/python -m tests.support.notebooks
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache

@@ -28,5 +28,7 @@ def _cell(cell: Any) -> list[str]:
 def _output(output: Any) -> str:
     if output.output_type == "stream":
         return f"```text\n{output.text.rstrip()}\n```"
-    picture = output.get("data", {}).get("image/png")
-    return f"![What the cell above draws](data:image/png;base64,{''.join(picture.split())})" if picture else ""
+    shown = output.get("data", {})
+    if "image/png" in shown:
+        return f"![What the cell above draws](data:image/png;base64,{''.join(shown['image/png'].split())})"
+    return str(shown.get("text/markdown", ""))

@@ -33,6 +33,8 @@ def executed(name: str, scratch: Path) -> nbformat.NotebookNode:
     client = NotebookClient(
         notebook, timeout=_TIMEOUT_S, resources={"metadata": {"path": str(scratch)}}, record_timing=False
     )
+    manager = client.create_kernel_manager()
+    manager.transport, manager.ip = "ipc", str(scratch / "kernel")  # sockets in a folder, no ports
     path = os.pathsep.join((str(ROOT), *filter(None, [environment.get("PYTHONPATH")])))
     client.execute(env={**environment, "PYTHONPATH": path})
     return notebook
