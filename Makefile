@@ -71,9 +71,10 @@ mutants: $(STAMP)  ## code made wrong on purpose: what the fast tests notice, an
 fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (20 minutes)
 	$(BIN)/python tests/fuzz/fuzz_folders.py
 
-generate: $(STAMP)  ## the files made from firmware_iface/registers.toml and the safety table
+generate: $(STAMP)  ## the files made from firmware_iface/registers.toml, the safety table and the configuration's schema
 	$(BIN)/python -m firmware_iface.generate
 	$(BIN)/python -m tests.support.faults_page
+	$(BIN)/membrane-ctrl config reference > docs/configuration.md
 
 notebooks: $(STAMP)  ## runs docs/notebooks and stores what they print and draw
 	$(BIN)/python -m tests.support.notebooks

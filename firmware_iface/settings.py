@@ -30,11 +30,16 @@ def _takes_truth(annotation: Any) -> bool:
     return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
 
 
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Micrometres = Annotated[float, Field(ge=-1e7, le=1e7)]  # ten metres
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Serial = Annotated[str, Field(max_length=80)]
 UnitId = Annotated[int, Field(ge=1, le=247)]
 Timeout = Annotated[float, Field(gt=0, le=5)]
 Baud = Annotated[int, Field(ge=300, le=1_000_000)]
-Direction = Literal[-1, 1]  # -1: the laser is behind the mirror, and a deeper bowl is nearer to it
-StepMax = Annotated[float, Field(gt=0, le=10_000)]  # readings farther than this from both previous ones are rejected
+Distance = Annotated[float, Field(ge=-1e4, le=1e4)]
+Direction = Literal[-1, 1]
+StepMax = Annotated[float, Field(gt=0, le=10_000)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 Port = Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, or usb:VID:PID[:SERIAL]
 ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://")]  # tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
@@ -45,13 +50,21 @@ class Optoncdt1420Config(Section):
 
     driver: Literal["optoncdt1420"] = "optoncdt1420"
     port: Port
+    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 921_600
-    rate_khz: float = 4.0
-    range_mm: Annotated[float, Field(gt=0, le=500)] | None = None  # refuse a sensor of another range
-    zero_mm: float | None = None  # distance from the start of the range at displacement 0; its middle when absent
+    """Baud rate as stored in the sensor. Change it if the sensor was set to another."""
+    rate_khz: Annotated[float, Field(ge=0.25, le=4)] = 4.0
+    """Measuring rate: 0.25, 0.5, 1, 2 or 4. Lower it with `baud`, or for a dark target."""
+    range_mm: Annotated[float, Field(gt=0, le=500)] | None = None
+    """Measuring range of the sensor. Set it to refuse a sensor of another range."""
+    zero_mm: Distance | None = None
+    """Distance from the start of the range at displacement 0; its middle when absent. Set it to move the zero."""
     direction: Direction = -1
+    """Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."""
     step_max_um: StepMax = 50.0
-    timeout_s: Timeout = 0.2  # for an answer, and for a new value after a reading
+    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
+    timeout_s: Timeout = 0.2
+    """Longest wait for an answer, and for a new value after a reading. Raise it on a slow machine."""
 
     @model_validator(mode="after")
     def _rate(self) -> "Optoncdt1420Config":
@@ -68,15 +81,22 @@ class KeyenceDlRs1aConfig(Section):
 
     driver: Literal["keyence_dl_rs1a"] = "keyence_dl_rs1a"
     port: Port
-    # baud and parity as set by the unit's switches: the factory's 9600 without parity is good for 25 readings a
-    # second, 38400 with even parity for 80
+    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Literal[2400, 4800, 9600, 19_200, 38_400] = 9600
+    """Baud rate as set by the unit's switches; 9600 gives 25 readings per second, 38400 gives 80.
+    Set it to 38400, with the switches."""
     parity: Literal["N", "E", "O"] = "N"
-    amplifier: Annotated[int, Field(ge=0, le=14)] = 0  # 0 is the main unit, 1..14 are expansions
-    zero_mm: float = 0.0  # value at displacement 0
+    """Parity as set by the switches. Set it to E, with the switches: without it a corrupted digit passes."""
+    amplifier: Annotated[int, Field(ge=0, le=14)] = 0
+    """0 is the main unit, 1 to 14 are expansions. Change it if the head is at an expansion."""
+    zero_mm: Distance = 0.0
+    """Value at displacement 0. Change it to move the zero."""
     direction: Direction = -1
+    """Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."""
     step_max_um: StepMax = 10.0
+    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
     timeout_s: Timeout = 0.1
+    """Longest wait for an answer. Raise it at low baud rates."""
 
 
 class VaisalaPtb330Config(Section):
@@ -84,10 +104,15 @@ class VaisalaPtb330Config(Section):
 
     driver: Literal["vaisala_ptb330"] = "vaisala_ptb330"
     port: Port
+    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 4800
-    period_s: Annotated[float, Field(gt=0, le=60)] = 0.2  # between requests; a message takes 80 ms at 4800 baud
-    age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0  # NaN if the measurement counter stands still longer
+    """Baud rate as stored in the instrument. Change it if the instrument was set to another."""
+    period_s: Annotated[float, Field(gt=0, le=60)] = 0.2
+    """Interval between requests; a message takes 80 ms at 4800 baud. Raise it at lower baud rates."""
+    age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+    """Age from which a value is no longer used. Raise it for a slow measurement."""
     timeout_s: Timeout = 0.3
+    """Longest wait for an answer. Raise it at low baud rates."""
 
 
 class VentusConfig(Section):
@@ -95,10 +120,11 @@ class VentusConfig(Section):
 
     driver: Literal["ventus"] = "ventus"
     port: Port
-    power_max_mw: Annotated[float, Field(gt=0, le=1400)] = (
-        1000.0  # full drive; none of these pumps takes more than 1400
-    )
+    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
+    power_max_mw: Annotated[float, Field(gt=0, le=1400)] = 1000.0
+    """Power at full drive; none of these pumps takes more than 1400. Change it to your pump's rating."""
     timeout_s: Timeout = 0.1
+    """Longest wait for an answer. Raise it on a slow machine."""
 
 
 class BronkhorstModbusConfig(Section):
@@ -106,9 +132,13 @@ class BronkhorstModbusConfig(Section):
 
     driver: Literal["bronkhorst_modbus"]
     link: ModbusUrl
+    """Its Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."""
     unit_id: UnitId
-    serial: str = ""  # refuse any other instrument; empty: take whichever answers
+    """Modbus address of the instrument. Set it as stored in the instrument."""
+    serial: Serial = ""
+    """Serial number; empty: whichever answers. Set it to refuse any other instrument."""
     timeout_s: Timeout = 0.2
+    """Longest wait for an answer. Raise it on a slow line."""
 
 
 class BronkhorstProparConfig(Section):
@@ -116,10 +146,15 @@ class BronkhorstProparConfig(Section):
 
     driver: Literal["bronkhorst_propar"] = "bronkhorst_propar"
     port: Port
+    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 38_400
-    node: Annotated[int, Field(ge=1, le=128)] = 128  # 128: whatever is at the end of the cable
-    serial: str = ""
+    """Baud rate as stored in the instrument. Change it if the instrument was set to another."""
+    node: Annotated[int, Field(ge=1, le=128)] = 128
+    """ProPar node; 128: whatever is at the end of the cable. Change it to insist on one node."""
+    serial: Serial = ""
+    """Serial number; empty: whichever answers. Set it to refuse any other instrument."""
     timeout_s: Timeout = 0.2
+    """Longest wait for an answer. Raise it on a slow machine."""
 
 
 class ModbusMapConfig(Section):
@@ -130,18 +165,31 @@ class ModbusMapConfig(Section):
 
     driver: Literal["modbus_map"]
     link: ModbusUrl
+    """Its Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."""
     unit_id: UnitId = 1
+    """Modbus address of the device. Change it if the device has another."""
     timeout_s: Timeout = 0.2
-    preset: str = ""  # a file of firmware_iface/presets that gives defaults for the keys below
+    """Longest wait for an answer. Raise it on a slow line."""
+    preset: str = ""
+    """File of firmware_iface/presets with defaults for the keys below. Set it if your device has one."""
     function: Literal["holding", "input"] | None = None
+    """Kind of register; holding when absent. Set it from the device's manual."""
     type: Literal["u16", "i16", "u32", "i32", "f32"] | None = None
+    """Type of the value in the registers; u16 when absent. Set it from the device's manual."""
     word_order: Literal["big", "little"] | None = None
+    """Which word of a 32-bit value comes first; big when absent. Set it from the device's manual."""
     address: Word
-    raw: tuple[float, float] | None = None
-    value: tuple[float, float]
-    limits: tuple[float, float] | None = None  # values outside are refused; by default the span of `value`
+    """Address of the first register, counted from 0. Set it from the device's manual."""
+    raw: tuple[Number, Number] | None = None
+    """Register contents at the two ends of `value`. Set it from the manual, e.g. the counts at 4 and 20 mA."""
+    value: tuple[Number, Number]
+    """Two values in the role's unit (um, Pa, degC, fraction), at the contents `raw`. Set it as scaled."""
+    limits: tuple[Number, Number] | None = None
+    """Values outside are refused; the span of `value` when absent. Set it wider for a sensor that exceeds it."""
     identity_address: Word | None = None
+    """Holding register that identifies the device. Set it to refuse any other device."""
     identity_equals: Word | None = None
+    """Content of that register. Set it together with `identity_address`."""
 
     @model_validator(mode="after")
     def _line(self) -> "ModbusMapConfig":
@@ -166,15 +214,21 @@ class AravisCameraConfig(Section):
     """A GenICam camera (USB3 Vision or GigE Vision)."""
 
     driver: Literal["aravis"] = "aravis"
-    camera: str = ""  # as listed by `devices`, or its address; empty: the first one found
-    # Bayer needs no demosaicing: each pixel's phase is independent of its gain
+    camera: str = ""
+    """Name as `devices` lists it, or its address; empty: the first one found. Set it if there are several."""
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"] = (
         "Mono8"
     )
+    """Format of a pixel. Bayer needs no demosaicing: each pixel's phase is independent of its gain.
+    Change it with `optics.camera.bits`, for a colour camera or for more depth."""
     exposure_ms: Annotated[float, Field(gt=0, le=10_000)] = 20.0
+    """Exposure of a frame. Change it to what the self test of the start suggests."""
     gain_db: Annotated[float, Field(ge=0, le=48)] = 0.0
-    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0  # GigE Vision; 0: negotiated by camera and network
-    timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0  # for a frame, from the end of its exposure
+    """Gain of the sensor. Raise it only if the exposure cannot be longer: it adds noise."""
+    packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0
+    """GigE Vision: size of a packet; 0: negotiated by camera and network. Set it to 8000 with jumbo frames."""
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0
+    """Longest wait for a frame, from the end of its exposure. Raise it on a slow network."""
 
     @property
     def bits(self) -> int:
@@ -186,10 +240,14 @@ class UvcCameraConfig(Section):
     """A USB camera without GenICam."""
 
     driver: Literal["uvc"] = "uvc"
-    port: str = "0"  # its number, or its path such as /dev/video0 (better: below /dev/v4l/by-id)
-    exposure: Annotated[float, Field(ge=0)] = 0.0  # in the camera's own unit, often 0.1 ms; 0 leaves it
-    gain: Annotated[float, Field(ge=0)] = 0.0  # in the camera's own unit; 0 leaves it
+    port: str = "0"
+    """Its number, or its path such as /dev/video0. Set it to a path below /dev/v4l/by-id, which stays the same."""
+    exposure: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Exposure in the camera's own unit, often 0.1 ms; 0 leaves it. Set it so that white does not saturate."""
+    gain: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Gain in the camera's own unit; 0 leaves it. Raise it only if the exposure cannot be longer."""
     bits: Literal[8] = 8
+    """Depth of a pixel. Leave it: these cameras give 8 bits."""
 
 
 class FolderCameraConfig(Section):
@@ -197,6 +255,7 @@ class FolderCameraConfig(Section):
 
     driver: Literal["folder"]
     folder: Annotated[str, Field(min_length=1)]
+    """Folder of pictures named like the patterns, e.g. x_sin_0.png. Set it to a capture set."""
 
 
 class PygameScreenConfig(Section):
@@ -204,13 +263,21 @@ class PygameScreenConfig(Section):
 
     driver: Literal["pygame"] = "pygame"
     display: Annotated[int, Field(ge=0, le=15)] = 0
+    """Number of the display. Change it if the desktop has several."""
     width_px: Annotated[int, Field(ge=16, le=16_384)]
+    """Columns of the panel. Set it to the panel's own; `devices` lists them."""
     height_px: Annotated[int, Field(ge=16, le=16_384)]
+    """Rows of the panel. Set it to the panel's own; `devices` lists them."""
     pixel_mm: Annotated[float, Field(gt=0.01, le=10)]
-    centre_px: tuple[float, float] | None = None  # (column, row) of O'; the screen's middle when absent
-    settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None  # measured at the start when absent
-    linearise: bool = True  # measure the display's response at the start and correct it
-    self_test: bool = True  # exposure and checkerboard at the start
+    """Pitch of its pixels. Set it from a rule laid over 1000 pixels."""
+    centre_px: tuple[Number, Number] | None = None
+    """(column, row) of O'; the screen's middle when absent. Set it if the pattern must be shifted."""
+    settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None
+    """Time until a new picture stands; measured at the start when absent. Set it to save that measurement."""
+    linearise: bool = True
+    """Measure the display's response at the start and correct it. Set it to false for a linear display."""
+    self_test: bool = True
+    """Test exposure and panel at the start. Set it to false to start sooner."""
 
 
 CameraConfig = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig, Field(discriminator="driver")]

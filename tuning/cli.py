@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     from tuning.command import TuneOptions
 
 
-app = typer.Typer(no_args_is_help=True, help="Tune the loops in sessions on a running hold, or on the twin.")
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Tune the loops in sessions on a running hold, or on the twin.",
+)
 
 TwinOption = Annotated[bool, typer.Option("--twin", help="Work on the twin, in virtual time.")]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin: its configuration.")]

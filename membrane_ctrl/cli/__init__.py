@@ -9,10 +9,13 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, holding, optics, records, reviewing
+from membrane_ctrl.cli import calibrating, configuring, holding, optics, records, reviewing
 from membrane_ctrl.model import errors, terminal
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+# Markdown, because Rich's own markup takes [devices] in a help text for a style
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown"
+)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -25,7 +28,8 @@ def run(arguments: Sequence[str]) -> int:
                 print(f"membrane-ctrl: {terminal.one_line(line)}", file=sys.stderr)
             return error.exit
         except typer.TyperException as error:
-            print(f"membrane-ctrl: {terminal.one_line(error.format_message())} (see --help)", file=sys.stderr)
+            if message := error.format_message():  # a group without a command has printed its help instead
+                print(f"membrane-ctrl: {terminal.one_line(message)} (see --help)", file=sys.stderr)
             return errors.Exit.BAD_INPUT
         except OSError as error:  # a file error that the command itself should have caught
             print(f"membrane-ctrl: {terminal.one_line(_file_trouble(error))}", file=sys.stderr)
@@ -63,7 +67,7 @@ def examples(name: Annotated[str, typer.Argument(help="File to print; by default
         raise errors.InputError(f"{name}: no such example; known: {', '.join(files)}")
 
 
-for _family in (holding, optics, calibrating, records, reviewing):
+for _family in (holding, configuring, optics, calibrating, records, reviewing):
     _family.add_commands(app)
 # tuning imports this package, not the reverse: `tune` is an entry point
 for _entry in entry_points(group="membrane_ctrl.subcommands"):

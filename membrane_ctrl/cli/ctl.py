@@ -60,7 +60,10 @@ class ActionFirst(TyperGroup):
 
 
 ctl_app = typer.Typer(
-    cls=ActionFirst, no_args_is_help=True, help="Control a running hold: show its status, or send a command."
+    cls=ActionFirst,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Control a running hold: show its status, or send a command.",
 )
 
 

@@ -10,7 +10,7 @@ from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import clock, errors, terminal
 
-alarm_app = typer.Typer(no_args_is_help=True)
+alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
 FlatOption = Annotated[
     bool, typer.Option("--from-flat", help="Start with a flat simulated mirror; filling it takes two hours.")

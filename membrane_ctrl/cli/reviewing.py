@@ -9,7 +9,7 @@ from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOpt
 
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
 
-runs_app = typer.Typer(invoke_without_command=True, help="List, show and prune runs.")
+runs_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown", help="List, show and prune runs.")
 
 
 def add_commands(app: typer.Typer) -> None:

@@ -1,41 +1,54 @@
-"""The screen in the configuration: its pose, and its face's departure from a plane."""
+"""The tables of the optics: camera, screen, pattern, mirror, and where they are."""
 
-from typing import Annotated
+from __future__ import annotations
 
-import numpy as np
-from pydantic import Field, model_validator
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
 
-from firmware_iface.settings import Section
+from pydantic import ConfigDict, Field, model_validator
 
-Vector3 = tuple[float, float, float]
-Axis = Annotated[tuple[float, ...], Field(min_length=2, max_length=500)]
+from firmware_iface.settings import Micrometres, Section
+
+Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # of whatever unit: a kilometre of mm
+Direction = Annotated[float, Field(ge=-1, le=1)]
+Vector3 = tuple[Length, Length, Length]
+Direction3 = tuple[Direction, Direction, Direction]
+Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
-_SQUARE = 1e-6  # of two unit vectors: rounding to seven digits
+_SQUARE = 1e-6  # of unit vectors: rounding to seven digits
 
 
 class HeightMapConfig(Section):
-    """Heights of the face towards the mirror at the nodes of an even grid, interpolated by a bicubic spline.
+    """Heights of the screen's face towards the mirror, interpolated by a bicubic spline through an even grid.
 
     `heights_mm[r][c]` belongs to `s_y_mm[r]` and `s_x_mm[c]`. With three nodes along an axis the spline is quadratic
     there, with two linear. In TOML, `file` may replace `heights_mm`: a text file of numbers, one row per line.
     """
 
+    model_config = ConfigDict(json_schema_extra=lambda schema: _or_file(schema))
+
     s_x_mm: Axis
+    """Columns of the grid along s_x, from O'. Set it to a grid that covers the pattern."""
     s_y_mm: Axis
+    """Rows of the grid along s_y, from O'. Set it to a grid that covers the pattern."""
     heights_mm: tuple[Axis, ...]
+    """Height at each node, a row for each `s_y_mm`. Set it from a measurement of the screen's face."""
 
     @model_validator(mode="after")
-    def _grid(self) -> "HeightMapConfig":
+    def _grid(self) -> HeightMapConfig:
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
-            steps = np.diff(axis)
-            if not (steps[0] > 0 and np.ptp(steps) <= _EVEN * steps[0]):
+            steps = [b - a for a, b in pairwise(axis)]
+            if not (steps[0] > 0 and max(steps) - min(steps) <= _EVEN * steps[0]):
                 raise ValueError(f"{name} must rise in even steps")
         rows, columns = len(self.s_y_mm), len(self.s_x_mm)
         if len(self.heights_mm) != rows or any(len(row) != columns for row in self.heights_mm):
             shape = f"{len(self.heights_mm)} rows of {', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
             raise ValueError(f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of {columns}")
-        if np.abs(self.heights_mm).max() > 100:  # no screen is that crooked: micrometres taken for millimetres?
+        if max(abs(h) for row in self.heights_mm for h in row) > 100:  # no screen is that crooked: um taken for mm?
             raise ValueError("heights_mm has a height beyond 100 mm")
         return self
 
@@ -43,14 +56,17 @@ class HeightMapConfig(Section):
 class ScreenPoseConfig(Section):
     """Any screen pose (O' in world, unit vectors `s_x` and `s_y`) and its face; both may be omitted.
 
-    The face departs from the plane along s_x x s_y, towards the mirror, by the bow (a paraboloid, given by its
-    height 200 mm from O') plus the height map.
+    The face departs from the plane along s_x x s_y, towards the mirror, by the bow plus the height map.
     """
 
     origin_mm: Vector3 | None = None
-    s_x: Vector3 | None = None
-    s_y: Vector3 | None = None
+    """O' in world. Set it from a calibration, together with `s_x` and `s_y`."""
+    s_x: Direction3 | None = None
+    """Direction of the screen's columns. Set it from a calibration."""
+    s_y: Direction3 | None = None
+    """Direction of the screen's rows, upwards. Set it from a calibration."""
     bow_mm: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    """Paraboloid of the face: its height 200 mm from O', towards the mirror. Change it to the calibrated one."""
     height_map: HeightMapConfig | None = None
 
     @property
@@ -61,14 +77,12 @@ class ScreenPoseConfig(Section):
         return self.origin_mm, self.s_x, self.s_y
 
     @model_validator(mode="after")
-    def _whole(self) -> "ScreenPoseConfig":
+    def _whole(self) -> ScreenPoseConfig:
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")
-        if self.s_x is not None and self.s_y is not None:
-            axes = np.array([self.s_x, self.s_y])
-            if not np.allclose(axes @ axes.T, np.eye(2), atol=_SQUARE):
-                raise ValueError("s_x and s_y are not two unit vectors at a right angle")
+        if self.s_x is not None and self.s_y is not None and not _orthonormal((self.s_x, self.s_y)):
+            raise ValueError("s_x and s_y are not two unit vectors at a right angle")
         return self
 
     def covers(self, half_side_mm: float) -> bool:
@@ -77,3 +91,146 @@ class ScreenPoseConfig(Section):
             return True
         axes = (self.height_map.s_x_mm, self.height_map.s_y_mm)
         return all(axis[0] <= -half_side_mm and axis[-1] >= half_side_mm for axis in axes)
+
+
+class PatternConfig(Section):
+    """Fringes on the screen (docs/interfaces.md)."""
+
+    steps: Annotated[int, Field(ge=3, le=64)] = 4
+    """Phase steps per axis. Raise it against harmonics of the display; each step takes a frame."""
+    periods: Annotated[int, Field(ge=1, le=8)] = 8
+    """Fringes across the pattern. Change it with `period_mm`, so that the pattern fits the screen."""
+    period_mm: Annotated[float, Field(ge=1, le=2000)] = 49.82
+    """Width of a fringe on the screen. Change it so that the reflected pattern covers the mirror."""
+
+
+class CameraPoseConfig(Section):
+    """Any camera pose."""
+
+    position_mm: Vector3
+    """Pinhole in world. Set it from a calibration or a survey."""
+    rotation: tuple[Direction3, Direction3, Direction3]
+    """Rows: the camera's x right, y down, z forward in world. Set it from a calibration."""
+
+    @model_validator(mode="after")
+    def _is_rotation(self) -> CameraPoseConfig:
+        (a, b, c), (d, e, f), (g, h, i) = self.rotation
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        if not _orthonormal(self.rotation) or determinant < 0:
+            raise ValueError("rotation is not a rotation matrix (rows: right, down, forward in world)")
+        return self
+
+
+class GeometryConfig(Section):
+    """Camera and screen: the paper's a, b, alpha, or two general poses (docs/interfaces.md).
+
+    In either form, `screen` may give the departure of the screen's face from its plane.
+    """
+
+    a_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
+    """Distance from the mirror's vertex to the camera's pinhole. Set it to the measured distance."""
+    b_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
+    """Distance from the mirror's vertex to O', the pattern's centre. Set it to the measured distance."""
+    alpha_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
+    """Angle of either line of sight above the mirror's plane. Set it to the measured angle."""
+    a_sigma_mm: Annotated[float, Field(ge=0, le=1e5)] | None = None
+    """Standard uncertainty of `a_mm`. Set it to get the error bars of the height."""
+    b_sigma_mm: Annotated[float, Field(ge=0, le=1e5)] | None = None
+    """Standard uncertainty of `b_mm`. Set it to get the error bars of the height."""
+    alpha_sigma_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    """Standard uncertainty of `alpha_deg`. Set it to get the error bars of the height."""
+    reference_displacement_um: Micrometres | None = None
+    """Displacement at which the geometry was measured; the first frame's when absent.
+    Set it if the mirror stood elsewhere then."""
+    camera: CameraPoseConfig | None = None
+    screen: ScreenPoseConfig | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> GeometryConfig:
+        short = (self.a_mm, self.b_mm, self.alpha_deg)
+        general = (self.camera, None if self.screen is None else self.screen.pose)
+        if all(v is not None for v in short) and all(v is None for v in general):
+            return self
+        if all(v is None for v in short) and all(v is not None for v in general):
+            return self
+        raise ValueError("give either a_mm, b_mm and alpha_deg, or both [camera] and [screen] poses")
+
+
+class CameraConfig(Section):
+    """Sensor and lens."""
+
+    width_px: Annotated[int, Field(ge=8, le=20_000)] = 2448
+    """Columns of the sensor. Set it to the camera's; another size is refused."""
+    height_px: Annotated[int, Field(ge=8, le=20_000)] = 2048
+    """Rows of the sensor. Set it to the camera's; another size is refused."""
+    focal_mm: Annotated[float, Field(ge=1, le=1000)] = 16.0
+    """Focal length. Set it to the lens's, or better the calibrated one."""
+    pixel_um: Annotated[float, Field(ge=0.5, le=500)] = 3.45
+    """Pitch of the pixels. Set it from the camera's data sheet."""
+    principal_px: tuple[Length, Length] | None = None
+    """Principal point (column, row); the sensor's middle when absent. Set it from `calibrate-camera`."""
+    distortion: tuple[Length, ...] = ()
+    """OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. Set it from `calibrate-camera`."""
+    noise_adu: Annotated[float, Field(ge=0, le=65_535)] = 0.4
+    """Noise of a pixel, for the error bars. Change it to the measured one."""
+    bits: Annotated[int, Field(ge=8, le=16)] = 8
+    """Depth of a pixel. Change it with `devices.camera.pixel_format`."""
+
+    @property
+    def principal(self) -> tuple[float, float]:
+        """Principal point as (column, row) in pixels."""
+        return self.principal_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+
+class MirrorConfig(Section):
+    """The film's rim and its measured part."""
+
+    radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 500.0
+    """Radius of the ring, and of the Zernike terms. Set it to the mirror's."""
+    analysis_radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 475.0
+    """Radius of the part that is measured. Lower it to leave out a bad edge."""
+    sag_mm: Annotated[float, Field(ge=0.1, le=10_000)] = 37.1
+    """Depth of the bowl at displacement 0. Set it for another film: laser and gauge are compared with it."""
+    pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0
+    """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
+
+    @model_validator(mode="after")
+    def _inside(self) -> MirrorConfig:
+        if self.analysis_radius_mm > self.radius_mm:
+            raise ValueError("analysis_radius_mm is larger than radius_mm")
+        return self
+
+
+class OpticsConfig(Section):
+    """What deflectometry must know about the bench."""
+
+    geometry: GeometryConfig = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
+    camera: CameraConfig = CameraConfig()
+    pattern: PatternConfig = PatternConfig()
+    mirror: MirrorConfig = MirrorConfig()
+    geometry_file: Path | None = None
+    """Geometry written by `calibrate`; replaces `geometry`. Set it after a calibration."""
+
+    @model_validator(mode="after")
+    def _map_covers_pattern(self) -> OpticsConfig:
+        half_mm = self.pattern.periods * self.pattern.period_mm / 2
+        if self.geometry.screen is not None and not self.geometry.screen.covers(half_mm):
+            raise ValueError(
+                f"geometry.screen.height_map must reach over the pattern, {half_mm:g} mm from O' each way"
+            )
+        return self
+
+
+def _or_file(schema: dict[str, Any]) -> None:
+    """Let `file` replace `heights_mm` in the JSON schema, as `toml_file` does when it reads."""
+    schema["properties"]["file"] = {
+        "type": "string",
+        "description": "Text file with the rows of `heights_mm`. Set it for a large map.",
+    }
+    schema["required"].remove("heights_mm")
+
+
+def _orthonormal(rows: Sequence[Vector3]) -> bool:
+    """Whether the rows are unit vectors at right angles."""
+    products = [(sum(x * y for x, y in zip(a, b, strict=True)), float(a is b)) for a in rows for b in rows]
+    return all(math.isclose(product, wanted, abs_tol=_SQUARE) for product, wanted in products)

@@ -10,28 +10,40 @@ from firmware_iface.settings import Section
 from membrane_ctrl.model.telemetry import FIELDS
 
 Seconds = Annotated[float, Field(ge=0, le=1e6)]
+Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
 class TlsConfig(Section):
     """The port on TCP, with a certificate on either side (docs/control-port.md)."""
 
     host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535)] = 7470  # 0: any free one, named in the "port" event
+    """Address to listen on. Change it to let other machines connect."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 7470
+    """TCP port; 0: any free one, named in the event `port`. Change it if another program has it."""
     certificate_file: str
+    """The hold's certificate. Set it to a file beside the configuration or elsewhere."""
     key_file: str
-    client_ca_file: str  # accepts certificates it has signed; the role is the OU of the client's certificate
+    """The key of that certificate. Set it to a file that only the hold can read."""
+    client_ca_file: str
+    """CA whose certificates are accepted; their OU is the role. Set it to your laboratory's CA."""
 
 
 class PortConfig(Section):
     """Where a running hold listens."""
 
     enabled: bool = True
-    socket: str | None = None  # control.sock beside the run folders when absent
-    group: str | None = None  # owns the socket file if the process may chown it; its members may connect
-    group_role: Literal["read", "operate", "tune"] = "operate"  # for everyone but the owner and root, who have `tune`
+    """Listen for commands. Set it to false to take none but signals."""
+    socket: str | None = None
+    """Socket file; control.sock beside the run folders when absent. Set it for a path that others expect."""
+    group: str | None = None
+    """Group that owns the socket file, whose members may connect. Set it to let others operate the mirror."""
+    group_role: Literal["read", "operate", "tune"] = "operate"
+    """Role of everyone but the owner and root, who have `tune`. Change it to restrict or trust the group."""
     commander_lapses_s: Annotated[float, Field(ge=1, le=1e6)] = 600.0
+    """Silence after which another may command without --take-over. Change it to the pace of your shifts."""
     tls: TlsConfig | None = None
-    metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None  # Prometheus, on 127.0.0.1 only
+    metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """Port of the Prometheus metrics, on 127.0.0.1 only; absent: none. Set it to monitor the hold."""
 
 
 class AlarmRule(Section):
@@ -41,12 +53,19 @@ class AlarmRule(Section):
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+    """Name of the alarm in messages. Set it to a word of lower-case letters, digits and `_`."""
     field: str
-    raise_at: float
-    clear_at: float
-    magnitude: bool = False  # use the value's magnitude
+    """Telemetry field to watch. Set it to a field of docs/recording.md, e.g. `error_um`."""
+    raise_at: Limit
+    """Value at which the alarm is raised, in the field's unit. Set it beyond what weather does."""
+    clear_at: Limit
+    """Value at which it is cleared. Set it on the good side of `raise_at`, or the alarm flaps."""
+    magnitude: bool = False
+    """Judge the value without its sign. Set it to true for errors of either sign."""
     for_s: Seconds = 30.0
+    """Time beyond the limit before the alarm. Raise it to ignore gusts."""
     severity: Literal["warning", "critical"] = "warning"
+    """Severity in the message. Change it to critical for what must wake somebody."""
 
     @model_validator(mode="after")
     def _sound(self) -> AlarmRule:
@@ -68,13 +87,21 @@ _RULES = (
 class AlarmsConfig(Section):
     """Which alarms go to whom. Without `urls_file` none are sent."""
 
-    urls_file: str | None = None  # one Apprise URL per line; separate, because every run copies the configuration
-    escalation_urls_file: str | None = None  # notified when nobody acknowledges
+    urls_file: str | None = None
+    """File with one Apprise URL per line, kept apart because every run copies the configuration.
+    Set it to send alarms; without it none are sent."""
+    escalation_urls_file: str | None = None
+    """The same for those who are notified when nobody acknowledges. Set it if there is a second person to tell."""
     escalate_after_s: Annotated[float, Field(ge=1, le=1e6)] = 900.0
+    """Time without acknowledgement before that. Lower it where minutes count."""
     remind_every_s: Annotated[float, Field(ge=60, le=1e6)] = 3600.0
-    clear_after_s: Seconds = 30.0  # absent this long: cleared; back sooner: the same alarm
-    silent_s: Annotated[float, Field(ge=1, le=3600)] = 5.0  # no tick for this long is an alarm of its own
+    """Interval of the reminders. Change it to what people will not silence."""
+    clear_after_s: Seconds = 30.0
+    """Absence after which an alarm is cleared; back sooner, it is the same alarm. Raise it for what flickers."""
+    silent_s: Annotated[float, Field(ge=1, le=3600)] = 5.0
+    """Time without a tick that is an alarm of its own. Leave it, except on a machine that pauses."""
     rules: tuple[AlarmRule, ...] = _RULES
+    """Alarms on telemetry. Change it to add your own; a list replaces the default rules."""
 
     @model_validator(mode="after")
     def _names_differ(self) -> AlarmsConfig:

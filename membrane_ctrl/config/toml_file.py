@@ -123,11 +123,11 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     field = ".".join(str(part) for part in path)
     if error["type"] == "extra_forbidden":
         return (
-            f"{field}: unknown key; {_hint(str(error['loc'][-1]), [] if parent is None else [*parent.model_fields])}"
+            f"{field}: unknown key; {hint(str(error['loc'][-1]), [] if parent is None else [*parent.model_fields])}"
         )
     if error["type"] == "union_tag_invalid":
         tag, known = str(error["ctx"]["tag"]), re.findall(r"'([^']*)'", error["ctx"]["expected_tags"])
-        return f"{field}.driver: {tag!r} is not known here; {_hint(tag, known)}"
+        return f"{field}.driver: {tag!r} is not known here; {hint(tag, known)}"
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{field}: {message}" if field else message
@@ -136,9 +136,12 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
 
 
-def _hint(word: str, known: list[str]) -> str:
+def hint(word: str, known: list[str], otherwise: str = "") -> str:
+    """Return the nearest known word as a question; else `otherwise`, or all that are known."""
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}" if known else "remove it"
+    if near:
+        return f"did you mean {near[0]}?"
+    return otherwise or (f"known: {', '.join(known)}" if known else "remove it")
 
 
 def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
@@ -157,26 +160,26 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list
     members: list[type[BaseModel]] = []
     for place, part in enumerate(location):
         last = place + 1 == len(location)
-        if tagged := [m for m in members if part in _tags(m)]:
+        if tagged := [m for m in members if part in tags(m)]:
             inside, members = tagged[0], []
             continue
         path.append(part)
         if last or isinstance(part, int):
             continue
         field = None if inside is None else inside.model_fields.get(part)
-        members = [] if field is None else _sections(field.annotation)
+        members = [] if field is None else sections(field.annotation)
         inside = members[0] if members else None
     return path, inside
 
 
-def _sections(annotation: Any) -> list[type[BaseModel]]:
+def sections(annotation: Any) -> list[type[BaseModel]]:
     """Return all sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [section for inner in get_args(annotation) for section in _sections(inner)]
+    return [section for inner in get_args(annotation) for section in sections(inner)]
 
 
-def _tags(section: type[BaseModel]) -> tuple[Any, ...]:
+def tags(section: type[BaseModel]) -> tuple[Any, ...]:
     """Return the values of `driver` that select this section."""
     driver = section.model_fields.get("driver")
     return () if driver is None else get_args(driver.annotation)

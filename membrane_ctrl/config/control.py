@@ -1,0 +1,188 @@
+"""The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from firmware_iface.settings import Fraction, Micrometres, Section
+
+
+class LoopConfig(Section):
+    """The inner loop. The manipulated value is the pump's flow as a speed of the mirror's centre."""
+
+    rate_hz: Annotated[float, Field(ge=1, le=200)] = 50.0
+    """Ticks per second. Lower it for devices that answer slowly, and tune again."""
+    setpoint_um: Micrometres = 0.0
+    """Displacement to hold. Change it to hold another depth; in a running hold use `ctl setpoint`."""
+    kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
+    """Proportional gain; SIMC with the time constant of least predicted variance (docs/physics.md, inner loop).
+    Change it with `tune`: a larger gain follows gusts faster and passes more laser noise."""
+    ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
+    """Integral time. Change it with `tune`, together with `kp_per_s`."""
+    td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Derivative time; 0 for none. Leave it at 0: the film is an integrator, and a derivative only adds noise."""
+    setpoint_weight: Fraction = 1.0
+    """Share of the setpoint in the proportional term. Leave it at 1: the setpoint only ever ramps."""
+    measurement_filter_s: Annotated[float, Field(ge=0, le=10)] = 0.2
+    """Time constant of the filter on the laser reading; 0 for none. Change it with `tune`."""
+    flow_max_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
+    """Largest flow that the loop may command. Lower it to inflate or correct more gently."""
+    flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    """Fastest change of the flow. Lower it for a drive that must not be stepped."""
+    setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
+    """Speed at which the setpoint moves, upwards; downwards no faster than the leak.
+    Lower it if the mirror lags behind its ramp, for instance with a weaker pump."""
+    feedforward_barometer: bool = True
+    """Correct for the barometer's changes. Set it to false on a bench without a barometer."""
+    feedforward_temperature: bool = True
+    """Correct for the air thermometer's changes. Set it to false on a bench without a thermometer."""
+    barometer_gain_um_per_pa: Annotated[float, Field(ge=-10, le=10)] = -0.358
+    """Motion of the centre per pascal of ambient pressure. Change it if it was measured on another film."""
+    temperature_gain_um_per_k: Annotated[float, Field(ge=-2000, le=2000)] = 123.0
+    """Motion of the centre per kelvin of gas temperature. Change it if it was measured on another film."""
+    gas_follows_air_s: Annotated[float, Field(ge=0, le=3600)] = 12.0
+    """Time constant with which the gas follows the air's temperature. Change it for another depth or volume."""
+    feedforward_filter_s: Annotated[float, Field(ge=0, le=60)] = 0.2
+    """Filter on the weather sensors. Raise it for noisy sensors, at the cost of a later correction."""
+    bleed_fraction: Fraction = 0.0
+    """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 um/s)."""
+
+    @model_validator(mode="after")
+    def _filter_slower_than_tick(self) -> LoopConfig:
+        if 0 < self.measurement_filter_s < 0.5 / self.rate_hz:
+            raise ValueError("measurement_filter_s is shorter than half a tick: use 0 to switch it off")
+        return self
+
+
+class PumpConfig(Section):
+    """Flow of the pump against its command (docs/physics.md, film and gas); measure it with `tune pump`."""
+
+    flow_full_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
+    """Flow at full drive, as a speed of the centre. Change it to the measured one."""
+    dead_fraction: Fraction = 0.10
+    """Command at which the extrapolated flow is zero. Set it to 0 for a flow controller."""
+    start_fraction: Fraction = 0.22
+    """Command from which a pump at rest starts. Set it to 0 for a flow controller."""
+    stall_fraction: Fraction = 0.15
+    """Command below which a running pump stops. Set it to 0 for a flow controller."""
+
+
+class LimitsConfig(Section):
+    """Limits the mirror must never exceed."""
+
+    displacement_min_um: Micrometres = -2000.0
+    """Shallowest bowl while held; shallower is the fault `under_displacement`.
+    Change it to the laser's range and the optics' use."""
+    displacement_max_um: Micrometres = 500.0
+    """Deepest bowl; deeper is the fault `over_displacement`. Change it to what the film and the laser can take."""
+    gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
+    """Highest gauge pressure; above it the mirror is vented. Change it for another film, below what tears it."""
+    stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
+    """Time without a reading that counts as a loss. Raise it only for devices that answer that rarely."""
+    stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
+    """Identical laser readings for this long mean a dead sensor, because a film is never still.
+    Raise it for a laser with coarse steps on a calm mirror."""
+    lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
+    """Lateness of a tick that counts as missed control. Leave it, and move other work off a late machine."""
+    step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0
+    """Largest jump of the laser reading in a tick; no film jumps that far. Raise it at low tick rates."""
+    gauge_stuck_s: Annotated[float, Field(gt=0, le=1e5)] = 20.0
+    """Identical gauge readings for this long mean a dead gauge: noise of 0.5 Pa in steps of 0.001 Pa never repeats so
+    long, nor does a gauge that updates every second.
+    Raise it for a gauge that filters its noise below its own resolution, which repeats itself on a held mirror."""
+    gauge_step_max_pa: Annotated[float, Field(gt=0, le=5000)] = 30.0
+    """Largest jump of the gauge: a slammed door (100 Pa) moves it by 2 Pa, a storm of 250 Pa by 5 Pa.
+    Raise it for a noisier gauge."""
+    laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
+    """Largest contradiction of laser and gauge within minutes. 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean,
+    5 times the drift in two minutes of a mount at 2 um/min. Raise it for a noisier gauge."""
+    laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 100.0
+    """The same over hours: a gauge's zero drifts by 1 Pa/K (20 um/K), a fresh film creeps by 31 um (control/film.py).
+    Raise it for a gauge that drifts more."""
+    leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
+    """Factor by which the gas taken may grow unseen by a camera: a doubled leak is a leak, more may be a runaway.
+    Raise it for a film whose leak varies."""
+    following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0
+    """Largest distance from the setpoint. Raise it where gusts move the mirror farther."""
+    band_um: Annotated[float, Field(gt=0, le=1e4)] = 2.0
+    """Distance from the setpoint within which the mirror counts as held. Change it to what your optics need."""
+
+
+class StatesConfig(Section):
+    """How long states and safe levels may last."""
+
+    check_s: Annotated[float, Field(ge=0.1, le=600)] = 2.0
+    """Duration of good readings required before the pump may run. Raise it for slow sensors."""
+    check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    """Longest wait for those readings. Raise it for sensors that warm up."""
+    actuator_test: bool = True
+    """Pump up, pump off, vent, before a hold: does the film answer? Leave it on, except to debug a bench."""
+    inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0
+    """Longest inflation; a fill from flat takes two hours. Change it to twice the fill time of your mirror."""
+    inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0
+    """The ramp waits if the centre lags further. Raise it where gusts stop the ramp too often."""
+    inflate_stall_s: Annotated[float, Field(gt=0, le=1e6)] = 300.0
+    """Time in which an inflation must lift the mirror by its band: a pump of 1.2 times the leak takes 40 s, one that
+    takes longer than this is dead or too weak. Raise it for a weaker pump."""
+    settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5
+    """Time within the band before `hold` begins. Raise it where the mirror overshoots."""
+    settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
+    """Longest settling. Raise it for slow loops."""
+    hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
+    """Longest hold of the mean flow without a reading. 10 s cost 1.6 um on average (docs/physics.md); longer is no
+    glitch. Raise it where a longer loss is known to be harmless."""
+    ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
+    """Time in which the flow then ramps down. Leave it, except for a film that must be lowered more slowly."""
+    pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
+    """Time with the pump off after which the mirror is vented. Lower it if it must be empty sooner after a fault."""
+    lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
+    """Time by which a pump commanded off must have stopped. Raise it for a pump that runs down slowly."""
+    pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
+    """Longest `pause`; then the loop holds again. Raise it for longer work on the optics."""
+    manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
+    """Time after the last `manual` until the loop holds again. Raise it for longer experiments."""
+    manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0
+    """Distance from the setpoint at which `manual` and `pause` end. Raise it for larger experiments."""
+    vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0
+    """Gauge pressure below which `vent` is done. Change it for a gauge whose zero is uncertain."""
+    latch_twin_faults: bool = False
+    """Let a trip of the twin block the next run, as a real one does. Set it to true to practise recovery."""
+    stay_after_trip: bool = False
+    """Wait in `fault` for `ctl ack` instead of ending the run. Set it to true to acknowledge remotely."""
+
+
+class ResumeConfig(Section):
+    """Which latched faults may clear automatically once their cause has gone."""
+
+    faults: tuple[str, ...] = ()
+    """Names of those faults (docs/faults.md, "may resume"). Set it for known harmless causes, e.g. `link_lost`."""
+    wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
+    """Time without the cause before a resume. Raise it for causes that come and go."""
+    most_per_day: Annotated[int, Field(ge=0, le=1000)] = 3
+    """Most resumes in a day. Leave it low: a fault that returns needs a person."""
+
+
+class ShapeConfig(Section):
+    """The measurement cycle and the shape loop."""
+
+    enabled: bool = True
+    """Measure the shape and trim the setpoint. Set it to false on a bench without a camera."""
+    period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
+    """Interval between cycles. Raise it for a camera or machine that needs longer."""
+    frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
+    """Interval between the frames of a cycle. Raise it for a display that settles slowly."""
+    bin_px: Annotated[int, Field(ge=1, le=16)] = 4
+    """Side of the squares of camera pixels that are averaged. Lower it for more detail at more computing."""
+    time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
+    """Memory of the trim's tracker: a mount that starts to drift at 2 um/min is followed within 0.5 um
+    (control/filters.py). Change it with `tune outer`; noisier frames need a longer one."""
+    trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
+    """Fastest trim. Raise it for a mount that moves faster."""
+    trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0
+    """Largest trim. Raise it for a mount that drifts farther; then check the mount."""
+    fresh_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    """Age up to which a shape is used. Raise it with `period_s`, to several periods."""
+    disagreement_max_um: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """Largest jump between camera and laser that the trim follows. Raise it for noisier shapes."""

@@ -1,0 +1,235 @@
+"""What each key means: `docs/configuration.md`, the JSON schema and `config explain`, all made from the schema.
+
+Range and default come from pydantic, the unit from the key's name, meaning and advice from the text below the key.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import hint, sections
+from membrane_ctrl.model.errors import InputError
+
+_ADVICE = re.compile(r"(?<=[.;?])\s+(?=(?:Change|Leave|Lower|Raise|Set)\b)")
+_UNITS = {
+    "adu": "counts", "baud": "Bd", "bits": "bits", "bytes": "bytes", "cycles": "cycles", "day": "day", "days": "days",
+    "db": "dB", "deg": "deg", "fraction": "1", "gb": "GB", "hz": "Hz", "k": "K", "khz": "kHz", "mb": "MB",
+    "min": "min", "mm": "mm", "ms": "ms", "mw": "mW", "pa": "Pa", "px": "px", "s": "s", "s2": "s2", "um": "um",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of a table, as text; `unit` is empty for what is no quantity, `advice` says when to change it."""
+
+    name: str
+    unit: str
+    range: str
+    default: str
+    meaning: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True)
+class TableHelp:
+    """A table and where it may stand; one of a device has the name of its driver, and of several alike `many`."""
+
+    places: tuple[str, ...]
+    driver: str
+    many: bool
+    meaning: str
+    keys: tuple[Key, ...]
+
+    @property
+    def title(self) -> str:
+        """How the table begins in the file, or each of its places."""
+        headers = ", ".join(f"[[{place}]]" if self.many else f"[{place}]" for place in self.places)
+        return f'{headers} driver = "{self.driver}"' if self.driver else headers
+
+
+class _TomlSchema(GenerateJsonSchema):
+    """TOML has no null: an optional key is one that may be absent."""
+
+    def nullable_schema(self, schema: Any) -> dict[str, Any]:
+        return self.generate_inner(schema["schema"])
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+@cache
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of a configuration file, each key with its text. Treat it as constant."""
+    schema = Config.model_json_schema(schema_generator=_TomlSchema)
+    texts, chosen = _texts(), set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
+    for name, table in schema["$defs"].items():
+        for key, field in table["properties"].items():
+            if text := texts.get((name, key)):
+                field["description"] = text
+            if field.get("default", 0) is None:
+                del field["default"]
+        if name in chosen:  # from a union, by the driver: the file must name it, although the class has a default
+            table["required"] = sorted({*table.get("required", ()), "driver"})
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+@cache
+def tables() -> tuple[TableHelp, ...]:
+    """Every table of a configuration in the order of the schema, each once. Raises KeyError for an unknown unit."""
+    schema = json_schema()
+    places: dict[str, list[tuple[str, Any]]] = {}
+    for place, name, default in _places(schema, "", schema, Config().model_dump(mode="json")):
+        places.setdefault(name, []).append((place, default))
+    return tuple(_table(schema["$defs"][name], found) for name, found in places.items())
+
+
+def _places(schema: Any, prefix: str, table: Any, defaults: Any) -> Iterator[tuple[str, str, Any]]:
+    """Yield each table below another, outermost first: its place, the name of its class, its defaults."""
+    for key, field in table["properties"].items():
+        place = f"{prefix}{key}"
+        for name in re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(field)):
+            inner = defaults.get(key) if isinstance(defaults, dict) else None
+            yield place, name, inner
+            yield from _places(schema, f"{place}.", schema["$defs"][name], inner)
+
+
+def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
+    defaults = next((default for _, default in found if isinstance(default, dict)), {})
+    required = table.get("required", ())
+    keys = []
+    for name, field in table["properties"].items():
+        if "$ref" in json.dumps({**field, "items": None}) or (name == "driver" and "const" in field):
+            continue  # a table of its own, or the name of this one
+        meaning, *advice = _ADVICE.split(" ".join(field.get("description", "").split()), maxsplit=1)
+        default = "required" if name in required else _shown(defaults.get(name, field.get("default")))
+        keys.append(Key(name, unit_of(name), _range(field), default, meaning, "".join(advice)))
+    driver = table["properties"].get("driver", {}).get("const", "")
+    places = tuple(dict.fromkeys(place for place, _ in found))
+    many = any(isinstance(default, list) for _, default in found)
+    return TableHelp(places, driver, many, " ".join(table["description"].split()), tuple(keys))
+
+
+def explained(word: str) -> tuple[TableHelp, ...]:
+    """The tables, or parts of them, that a word names: `loop`, `loop.kp_per_s`, `kp_per_s`, `devices.pump`, `ventus`.
+
+    Raises InputError with the nearest names.
+    """
+    wanted, found, known = word.strip("[]` "), [], []
+    for table in tables():
+        prefixes = [name for name in (*table.places, table.driver) if name]
+        names = {key.name: {key.name, *(f"{prefix}.{key.name}" for prefix in prefixes)} for key in table.keys}
+        known += [*prefixes, *(name for key in names.values() for name in sorted(key))]
+        keys = table.keys if wanted in prefixes else tuple(key for key in table.keys if wanted in names[key.name])
+        if keys or wanted in prefixes:
+            found.append(replace(table, keys=keys))
+    if not found:
+        inside = sorted({name for name in known if wanted and wanted in name}, key=len)[:3]
+        near = f"did you mean {' or '.join(inside)}?" if inside else hint(wanted, known, "see `config reference`")
+        raise InputError(f"{word}: no such key or table; {near}")
+    return tuple(found)
+
+
+def unit_of(name: str) -> str:
+    """Return the unit at the end of a key's name: `um/s` of `flow_max_um_per_s`, empty without one."""
+    words = name.split("_")
+    if words[-1] not in _UNITS or (len(words) == 1 and words[0] not in ("baud", "bits")):
+        return ""
+    if words[-2:-1] != ["per"]:
+        return _UNITS[words[-1]]
+    return f"{_UNITS.get(words[-3], '1')}/{_UNITS[words[-1]]}"
+
+
+def _range(field: Any) -> str:
+    """Return the valid values of a key, in words."""
+    if "const" in field or "enum" in field:
+        return ", ".join(str(value) for value in field.get("enum", [field.get("const")]))
+    kind = field.get("type", "")
+    if kind in ("number", "integer"):
+        low = f"above {field['exclusiveMinimum']:g}" if "exclusiveMinimum" in field else f"{field['minimum']:g}"
+        high = f"below {field['exclusiveMaximum']:g}" if "exclusiveMaximum" in field else f"{field['maximum']:g}"
+        return f"{low} .. {high}" + (", whole" if kind == "integer" else "")
+    if kind == "array":
+        parts = field.get("prefixItems")
+        return f"{len(parts)} x ({_range(parts[0])})" if parts else f"list of {_range(field['items'])}"
+    if kind == "boolean":
+        return "true, false"
+    if "pattern" in field:
+        return f"text like {field['pattern']}"
+    return "a table" if "$ref" in field else "a file" if field.get("format") == "path" else "text"
+
+
+def _shown(default: Any) -> str:
+    """Return a default as in TOML; "none" for an absent key."""
+    if isinstance(default, list) and default and isinstance(default[0], dict):
+        return f"{len(default)} tables"
+    return "none" if default is None else json.dumps(default)
+
+
+def _texts() -> dict[tuple[str, str], str]:
+    """Return the text below each key of the schema's classes, read from their sources."""
+    found = {}
+    for name in {section.__module__ for section in _classes(Config)}:
+        source = Path(str(sys.modules[name].__file__)).read_text(encoding="utf-8")
+        for node in ast.parse(source).body:
+            body = node.body if isinstance(node, ast.ClassDef) else []
+            for key, text in pairwise(body):
+                if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
+                    continue
+                if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                    found[getattr(node, "name", ""), key.target.id] = " ".join(str(text.value.value).split())
+    return found
+
+
+def _classes(section: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    yield section
+    for field in section.model_fields.values():
+        for inner in sections(field.annotation):
+            yield from _classes(inner)
+
+
+def page() -> str:
+    """docs/configuration.md."""
+    lines = _PAGE.splitlines()
+    for table in tables():
+        lines += ["", f"## {table.driver or table.places[0]}", "", f"`{table.title}`: {table.meaning}"]
+        if table.keys:
+            lines += [
+                "",
+                "| key | unit | range | default | meaning | when to change it |",
+                "|---|---|---|---|---|---|",
+            ]
+        for key in table.keys:
+            cells = (f"`{key.name}`", key.unit, key.range, f"`{key.default}`", key.meaning, key.advice)
+            lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join([*lines, ""])
+
+
+_PAGE = """\
+# Configuration
+
+Made from the schema by `make generate`; do not edit.
+
+The configuration is one TOML file in UTF-8. Omitted keys use their defaults; most benches need only `[devices]`.
+`membrane-ctrl config init` writes a first file, `membrane-ctrl check` checks it, and
+`membrane-ctrl config explain KEY` shows a part of this page.
+
+An editor can complete and check keys. Write the schema beside the file with
+`membrane-ctrl config schema > membrane-ctrl.schema.json`, and make `#:schema ./membrane-ctrl.schema.json` the file's
+first line (taplo, or Even Better TOML in VS Code). The schema knows each key by itself; `check` also compares keys
+with each other and with the devices.
+
+Relative file names start at the configuration's folder. Numbers have a decimal point. The default `none` means that
+the key is absent."""

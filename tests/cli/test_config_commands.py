@@ -1,0 +1,141 @@
+"""`config init`, `config explain` and the others, as their user calls them."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+from pathlib import Path
+
+import pytest
+from patience import patient_check
+from test_examples import StillPlant
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.commissioning import devices, first_config
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.sim.lab import Lab
+
+FOUND = [devices.FoundDevice("port", "/dev/ttyUSB0: FTDI", 'port = "usb:0403:6001"')]
+
+
+@pytest.fixture(autouse=True)
+def connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_config, "_connected", lambda: FOUND)
+
+
+def answered(monkeypatch: pytest.MonkeyPatch, path: Path, *answers: str) -> int:
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join([*answers, ""])))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    return run(["config", "init", str(path)])
+
+
+@pytest.mark.parametrize("options", [["--twin"], []], ids=["twin", "nobody to ask"])
+async def test_the_first_configuration_passes_check_against_the_twin(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    path = tmp_path / "lab.toml"
+    assert run(["config", "init", str(path), *options]) == 0
+    text = path.read_text()
+    assert ("FTDI" in text) == (not options)
+    config = load(path, Config)
+    assert config == Config.model_validate({"devices": {"board": "tcp://127.0.0.1:5020"}})
+    assert config.devices is not None
+    lab = Lab(StillPlant(), config.devices)
+    try:
+        board = (await lab.start()).board
+        path.write_text(text.replace("tcp://127.0.0.1:5020", str(board)))  # another test may have that port
+        with patient_check():
+            assert await asyncio.to_thread(run, ["check", str(path), "--json"]) == 0
+    finally:
+        await lab.stop()
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+def test_nothing_is_overwritten(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "lab.toml"
+    if kind == "file":
+        path.write_text("mine")
+    elif kind == "link":
+        path.symlink_to(tmp_path / "elsewhere")
+    else:
+        path.mkdir()
+    assert run(["config", "init", str(path), "--twin"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert not (tmp_path / "elsewhere").exists()
+    assert kind != "file" or path.read_text() == "mine"
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["config", "init", str(tmp_path / "no" / "lab.toml"), "--twin"]) == 2
+    assert "cannot be written (no such file or directory)" in capsys.readouterr().err
+
+
+def test_a_board_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "") == 0
+    config = load(path, Config)
+    assert config.devices is not None
+    assert config.devices.board == "tcp://10.0.0.9:502"
+    assert not config.shape.enabled  # no camera was named
+    assert config.loop == Config().loop
+
+
+def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    laser = ["optoncdt", "optoncdt1420", "usb:0403:6001"]  # a typing error first
+    pump = ["bronkhorst_modbus", "/dev/x", "3", "bronkhorst_modbus", "rtu:///dev/ttyUSB1", "3"]  # no URL first
+    gauge = ["bronkhorst_modbus", "rtu:///dev/ttyUSB1", "5"]
+    screen = ["pygame", "1920", "1080", "0.4961"]
+    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "uvc", *screen) == 0
+    config = load(path, Config)
+    assert config.devices is not None
+    assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure"}
+    assert config.devices.screen is not None
+    assert config.devices.screen.pixel_mm == 0.4961
+    assert config.shape.enabled
+    assert not config.loop.feedforward_barometer
+    assert not config.loop.feedforward_temperature
+    assert config.pump.start_fraction == 0.0
+    told = capsys.readouterr().err
+    assert "did you mean optoncdt1420?" in told
+    assert "pump: link" in told
+    assert "# Modbus address of the instrument." in path.read_text()
+
+
+def test_answers_that_contradict_each_other_write_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    answers = ["", "optoncdt1420", "/dev/x", "ventus", "/dev/x", "bronkhorst_propar", "/dev/y", "", "", "", ""]
+    assert answered(monkeypatch, path, *answers) == 2
+    assert "displacement and pump name the same port" in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_an_end_of_the_answers_writes_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "lab.toml"
+    assert answered(monkeypatch, path) == 130
+    assert not path.exists()
+
+
+def test_explain_prints_the_key(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["config", "explain", "flow_max_um_per_s"]) == 0
+    printed = capsys.readouterr().out
+    assert "[loop]" in printed
+    assert "flow_max_um_per_s: above 0 .. 100 um/s; default 5.3\n" in printed
+    assert "Lower it" in printed
+    assert run(["config", "explain", "loop.flow_max_um_per_s", "--json"]) == 0
+    ((key,),) = (table["keys"] for table in json.loads(capsys.readouterr().out)["tables"])
+    assert (key["unit"], key["default"]) == ("um/s", "5.3")
+
+
+def test_the_schema_is_json_and_the_reference_the_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["config", "schema"]) == 0
+    assert json.loads(capsys.readouterr().out)["additionalProperties"] is False
+    assert run(["config", "reference"]) == 0
+    assert capsys.readouterr().out.startswith("# Configuration\n")
