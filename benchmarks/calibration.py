@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.calibration.sets import phases_of
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm

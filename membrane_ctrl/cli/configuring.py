@@ -1,6 +1,5 @@
 """The commands of `config`: what a configuration may hold, and a first one."""
 
-import sys
 import textwrap
 from dataclasses import asdict
 from json import dumps
@@ -76,4 +75,4 @@ def init(
     """Write a first configuration, with what is connected; on a terminal, ask for the devices."""
     from membrane_ctrl.commissioning.first_config import write_first
 
-    return write_first(file, twin, ask=sys.stdin.isatty() and not twin)
+    return write_first(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)

@@ -1,7 +1,5 @@
 """The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -50,7 +48,7 @@ class LoopConfig(Section):
     """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 um/s)."""
 
     @model_validator(mode="after")
-    def _filter_slower_than_tick(self) -> LoopConfig:
+    def _filter_slower_than_tick(self) -> "LoopConfig":
         if 0 < self.measurement_filter_s < 0.5 / self.rate_hz:
             raise ValueError("measurement_filter_s is shorter than half a tick: use 0 to switch it off")
         return self

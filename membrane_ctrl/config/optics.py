@@ -1,9 +1,5 @@
 """The tables of the optics: camera, screen, pattern, mirror, and where they are."""
 
-from __future__ import annotations
-
-import math
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,9 +9,7 @@ from pydantic import ConfigDict, Field, model_validator
 from firmware_iface.settings import Micrometres, Section
 
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # of whatever unit: a kilometre of mm
-Direction = Annotated[float, Field(ge=-1, le=1)]
 Vector3 = tuple[Length, Length, Length]
-Direction3 = tuple[Direction, Direction, Direction]
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
@@ -39,7 +33,7 @@ class HeightMapConfig(Section):
     """Height at each node, a row for each `s_y_mm`. Set it from a measurement of the screen's face."""
 
     @model_validator(mode="after")
-    def _grid(self) -> HeightMapConfig:
+    def _grid(self) -> "HeightMapConfig":
         for name, axis in (("s_x_mm", self.s_x_mm), ("s_y_mm", self.s_y_mm)):
             steps = [b - a for a, b in pairwise(axis)]
             if not (steps[0] > 0 and max(steps) - min(steps) <= _EVEN * steps[0]):
@@ -61,9 +55,9 @@ class ScreenPoseConfig(Section):
 
     origin_mm: Vector3 | None = None
     """O' in world. Set it from a calibration, together with `s_x` and `s_y`."""
-    s_x: Direction3 | None = None
+    s_x: Vector3 | None = None
     """Direction of the screen's columns. Set it from a calibration."""
-    s_y: Direction3 | None = None
+    s_y: Vector3 | None = None
     """Direction of the screen's rows, upwards. Set it from a calibration."""
     bow_mm: Annotated[float, Field(ge=-100, le=100)] = 0.0
     """Paraboloid of the face: its height 200 mm from O', towards the mirror. Change it to the calibrated one."""
@@ -77,7 +71,7 @@ class ScreenPoseConfig(Section):
         return self.origin_mm, self.s_x, self.s_y
 
     @model_validator(mode="after")
-    def _whole(self) -> ScreenPoseConfig:
+    def _whole(self) -> "ScreenPoseConfig":
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")
@@ -109,11 +103,11 @@ class CameraPoseConfig(Section):
 
     position_mm: Vector3
     """Pinhole in world. Set it from a calibration or a survey."""
-    rotation: tuple[Direction3, Direction3, Direction3]
+    rotation: tuple[Vector3, Vector3, Vector3]
     """Rows: the camera's x right, y down, z forward in world. Set it from a calibration."""
 
     @model_validator(mode="after")
-    def _is_rotation(self) -> CameraPoseConfig:
+    def _is_rotation(self) -> "CameraPoseConfig":
         (a, b, c), (d, e, f), (g, h, i) = self.rotation
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if not _orthonormal(self.rotation) or determinant < 0:
@@ -146,7 +140,7 @@ class GeometryConfig(Section):
     screen: ScreenPoseConfig | None = None
 
     @model_validator(mode="after")
-    def _one_form(self) -> GeometryConfig:
+    def _one_form(self) -> "GeometryConfig":
         short = (self.a_mm, self.b_mm, self.alpha_deg)
         general = (self.camera, None if self.screen is None else self.screen.pose)
         if all(v is not None for v in short) and all(v is None for v in general):
@@ -195,7 +189,7 @@ class MirrorConfig(Section):
     """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
 
     @model_validator(mode="after")
-    def _inside(self) -> MirrorConfig:
+    def _inside(self) -> "MirrorConfig":
         if self.analysis_radius_mm > self.radius_mm:
             raise ValueError("analysis_radius_mm is larger than radius_mm")
         return self
@@ -212,7 +206,7 @@ class OpticsConfig(Section):
     """Geometry written by `calibrate`; replaces `geometry`. Set it after a calibration."""
 
     @model_validator(mode="after")
-    def _map_covers_pattern(self) -> OpticsConfig:
+    def _map_covers_pattern(self) -> "OpticsConfig":
         half_mm = self.pattern.periods * self.pattern.period_mm / 2
         if self.geometry.screen is not None and not self.geometry.screen.covers(half_mm):
             raise ValueError(
@@ -230,7 +224,7 @@ def _or_file(schema: dict[str, Any]) -> None:
     schema["required"].remove("heights_mm")
 
 
-def _orthonormal(rows: Sequence[Vector3]) -> bool:
+def _orthonormal(rows: tuple[Vector3, ...]) -> bool:
     """Whether the rows are unit vectors at right angles."""
-    products = [(sum(x * y for x, y in zip(a, b, strict=True)), float(a is b)) for a in rows for b in rows]
-    return all(math.isclose(product, wanted, abs_tol=_SQUARE) for product, wanted in products)
+    products = [(sum(x * y for x, y in zip(a, b, strict=True)), a is b) for a in rows for b in rows]
+    return all(abs(product - same) <= _SQUARE for product, same in products)

@@ -1,7 +1,5 @@
 """Configuration of the control port and of the alarms."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -68,7 +66,7 @@ class AlarmRule(Section):
     """Severity in the message. Change it to critical for what must wake somebody."""
 
     @model_validator(mode="after")
-    def _sound(self) -> AlarmRule:
+    def _sound(self) -> "AlarmRule":
         if self.field not in FIELDS:
             raise ValueError(f"field: unknown telemetry field {self.field!r}; known: {', '.join(FIELDS)}")
         if self.raise_at == self.clear_at:
@@ -104,7 +102,7 @@ class AlarmsConfig(Section):
     """Alarms on telemetry. Change it to add your own; a list replaces the default rules."""
 
     @model_validator(mode="after")
-    def _names_differ(self) -> AlarmsConfig:
+    def _names_differ(self) -> "AlarmsConfig":
         names = [rule.name for rule in self.rules]
         if len(set(names)) < len(names):
             raise ValueError("rules: two rules have the same name")

@@ -3,17 +3,14 @@
 Range and default come from pydantic, the unit from the key's name, meaning and advice from the text below the key.
 """
 
-from __future__ import annotations
-
 import ast
+import inspect
 import json
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -181,9 +178,8 @@ def _shown(default: Any) -> str:
 def _texts() -> dict[tuple[str, str], str]:
     """Return the text below each key of the schema's classes, read from their sources."""
     found = {}
-    for name in {section.__module__ for section in _classes(Config)}:
-        source = Path(str(sys.modules[name].__file__)).read_text(encoding="utf-8")
-        for node in ast.parse(source).body:
+    for module in filter(None, {inspect.getmodule(section) for section in _classes(Config)}):
+        for node in ast.parse(inspect.getsource(module)).body:
             body = node.body if isinstance(node, ast.ClassDef) else []
             for key, text in pairwise(body):
                 if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):

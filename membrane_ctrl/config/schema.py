@@ -7,8 +7,6 @@ The text below a key says what it means and, from its first imperative ("Change"
 when to change it. Everything that explains the configuration is made from these texts (`config/reference.py`).
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -16,21 +14,12 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import AravisCameraConfig, Section, UvcCameraConfig
 from membrane_ctrl.config.control import LimitsConfig, LoopConfig, PumpConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.optics import (
-    CameraConfig,
-    CameraPoseConfig,
-    GeometryConfig,
-    MirrorConfig,
-    OpticsConfig,
-    PatternConfig,
-    Vector3,
-)
+from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.config.port import AlarmsConfig, PortConfig
 
 __all__ = [
-    "CameraConfig", "CameraPoseConfig", "Config", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig",
-    "OpticsConfig", "PatternConfig", "PumpConfig", "RecordingConfig", "ResumeConfig", "ShapeConfig", "StatesConfig",
-    "TwinConfig", "Vector3",
+    "CameraConfig", "Config", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig", "OpticsConfig",
+    "PatternConfig", "PumpConfig", "RecordingConfig", "ResumeConfig", "ShapeConfig", "StatesConfig", "TwinConfig",
 ]  # fmt: skip
 
 
@@ -103,7 +92,7 @@ class Config(Section):
     alarms: AlarmsConfig = AlarmsConfig()
 
     @model_validator(mode="after")
-    def _consistent(self) -> Config:
+    def _consistent(self) -> "Config":
         limits = self.limits
         if limits.displacement_min_um >= limits.displacement_max_um:
             raise ValueError("limits.displacement_min_um must be below limits.displacement_max_um")

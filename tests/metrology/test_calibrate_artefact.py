@@ -10,8 +10,7 @@ import pytest
 import tomli_w
 from calibration_truth import OPTICS, make
 
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.calibrate.artefact import Origin, general_covariance, tables_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, cone, look, pixel_grid, v_fold
 
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.bins import parameter_covariance, slope_per_screen
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.kernels import invert

@@ -7,8 +7,13 @@ import pytest
 from metrology_truth import SMALL, pixel_grid
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import (
+    CameraPoseConfig,
+    GeometryConfig,
+    HeightMapConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.metrology.calibrate.parameters import BenchGeometry
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.checked import check

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
+from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
 from membrane_ctrl.metrology.calibrate import parameters, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.config.schema import CameraPoseConfig, GeometryConfig, Vector3
+from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, Vector3
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")

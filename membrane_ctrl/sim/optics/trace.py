@@ -7,8 +7,7 @@ import numpy as np
 from numba import njit
 from scipy.interpolate import RectBivariateSpline
 
-from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraConfig, GeometryConfig
+from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
 

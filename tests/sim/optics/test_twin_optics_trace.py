@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.optics import ScreenPoseConfig
-from membrane_ctrl.config.schema import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig
+from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.trace import (
