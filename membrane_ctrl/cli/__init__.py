@@ -2,14 +2,13 @@
 
 import sys
 from collections.abc import Sequence
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, configuring, holding, optics, records, reviewing
+from membrane_ctrl.cli import calibrating, configuring, ctl, holding, optics, records, reviewing
 from membrane_ctrl.model import errors, terminal
 
 # Markdown, because Rich's own markup takes [devices] in a help text for a style
@@ -22,6 +21,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; print an expected failure on stderr, one line per finding."""
     with terminal.only_text():
         try:
+            _complete(arguments[0] if arguments else "")
             result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
         except errors.CommandError as error:
             for line in error.lines:
@@ -38,6 +38,21 @@ def run(arguments: Sequence[str]) -> int:
             print("membrane-ctrl: interrupted", file=sys.stderr)
             return errors.Exit.INTERRUPTED
         return int(result or 0)
+
+
+def _complete(word: str) -> None:
+    """Add what takes long to find, if `word` may mean it: the actions of `ctl`, the commands of other packages."""
+    names = {group.name for group in app.registered_groups}
+    if word == "ctl":
+        ctl.add_actions()
+    elif word not in names | {
+        each.name or getattr(each.callback, "__name__", "") for each in app.registered_commands
+    }:
+        from importlib.metadata import entry_points
+
+        for entry in entry_points(group="membrane_ctrl.subcommands"):  # tuning imports this package, not the reverse
+            if entry.name not in names:
+                app.add_typer(entry.load(), name=entry.name)
 
 
 def _file_trouble(error: OSError) -> str:
@@ -69,6 +84,3 @@ def examples(name: Annotated[str, typer.Argument(help="File to print; by default
 
 for _family in (holding, configuring, optics, calibrating, records, reviewing):
     _family.add_commands(app)
-# tuning imports this package, not the reverse: `tune` is an entry point
-for _entry in entry_points(group="membrane_ctrl.subcommands"):
-    app.add_typer(_entry.load(), name=_entry.name)

@@ -10,7 +10,6 @@ import typer
 from typer.core import TyperGroup
 
 from membrane_ctrl.cli.options import JsonOption
-from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model import clock
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
@@ -148,11 +147,18 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
     "latch": _latch,
 }
 
-_add("status", "Show the status once.", _plain)
-_add("watch", "Print a status line repeatedly until the run ends.", _watch)
-for _kind, _rule in TABLE.items():
-    if _kind in _OWN or not (_rule.needs or _kind.startswith("shape_")):  # `tune` is a separate command
-        _add(_kind, _rule.does, _OWN.get(_kind, _plain))
-_add("shape", "Switch the shape loop on or off.", _shape)
-_add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
-_add("release", "Release command, so that someone else may take it.", _plain)
+
+def add_actions() -> None:
+    """Add the commands of `ctl`. Other commands need not wait for the controller's table."""
+    from membrane_ctrl.controller.commands import TABLE
+
+    if ctl_app.registered_commands:
+        return
+    _add("status", "Show the status once.", _plain)
+    _add("watch", "Print a status line repeatedly until the run ends.", _watch)
+    for kind, rule in TABLE.items():
+        if kind in _OWN or not (rule.needs or kind.startswith("shape_")):  # `tune` is a separate command
+            _add(kind, rule.does, _OWN.get(kind, _plain))
+    _add("shape", "Switch the shape loop on or off.", _shape)
+    _add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
+    _add("release", "Release command, so that someone else may take it.", _plain)

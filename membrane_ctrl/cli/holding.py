@@ -1,14 +1,16 @@
 """The commands that hold a mirror, talk to a hold, or look at devices."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
-from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import clock, errors, terminal
+
+if TYPE_CHECKING:
+    from membrane_ctrl.config.schema import Config
 
 alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
@@ -93,9 +95,10 @@ def safe(
 
 def check(config: ConfigArgument, json: JsonOption = False) -> int:
     """Validate a configuration, probe its devices, and show what a hold would do."""
+    loaded = configured(config)  # first: a mistake shows at once
     from membrane_ctrl.commissioning.check import check_config
 
-    return check_config(configured(config), str(config), json)
+    return check_config(loaded, str(config), json)
 
 
 def devices(json: JsonOption = False) -> int:
@@ -135,7 +138,7 @@ def alarm_test(
     return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)
 
 
-def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Config:
+def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Config":
     """Return the configuration with the [devices] of the `--devices` file, which can also be used alone."""
     if devices is None:
         return configured(config)
@@ -147,7 +150,7 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> Conf
     return lab if config is None else configured(config).model_copy(update={"devices": lab.devices})
 
 
-def _started(config: Config, from_flat: bool) -> Config:
+def _started(config: "Config", from_flat: bool) -> "Config":
     if not from_flat:
         return config
     return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})

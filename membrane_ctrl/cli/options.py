@@ -1,14 +1,15 @@
 """Options that several commands share, and reading the configuration they name."""
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from firmware_iface.settings import Section
-from membrane_ctrl.config import schema, toml_file
+if TYPE_CHECKING:  # loading the configuration's tables takes longer than all commands' help
+    from firmware_iface.settings import Section
+    from membrane_ctrl.config.schema import Config
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound="Section")
 
 ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
 ConfigOption = Annotated[
@@ -31,11 +32,13 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
 
-def configured(path: Path | None) -> schema.Config:
+def configured(path: Path | None) -> "Config":
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
     The file names in it are relative to its own folder, not to the current one.
     """
+    from membrane_ctrl.config import schema, toml_file
+
     if path is None:
         return schema.Config()
     config = toml_file.load(path, schema.Config)

@@ -17,7 +17,7 @@ from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import optical_bench, session
 from membrane_ctrl.alarms.senders import require_sendable
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.port import AlarmsConfig, PortConfig
+from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
@@ -144,7 +144,7 @@ def _port(port: PortConfig) -> str:
     """Where the control port would listen. Raises InputError for unusable certificates."""
     if not port.enabled:
         return "off"
-    ways = [port.socket or f"{sockets.SOCKET_NAME} beside the run folders"]
+    ways = [port.socket or f"{SOCKET_NAME} beside the run folders"]
     if port.tls is not None:
         sockets.server_context(port.tls)
         ways.append(f"TLS on {port.tls.host}:{port.tls.port}")

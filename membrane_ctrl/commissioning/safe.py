@@ -16,7 +16,6 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port import client, sockets
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
@@ -138,9 +137,11 @@ async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
 
 def _hold_told(config: Config, folder: Path) -> str:
     """Latch a running hold; returns the result, empty if none answers."""
-    path = Path(config.port.socket) if config.port.socket else folder / sockets.SOCKET_NAME
+    path = config.port.socket_in(folder)
     if not config.port.enabled or not path.exists():
         return ""
+    from membrane_ctrl.control_port import client  # only now: the pump is stopped sooner without
+
     try:
         with client.PortClient.unix(path, notice=lambda _: None) as hold:
             answer = hold.ask(do="latch", text=_CAUSE, why="membrane-ctrl safe")

@@ -1,5 +1,6 @@
 """Configuration of the control port and of the alarms."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -7,6 +8,7 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import Section
 from membrane_ctrl.model.telemetry import FIELDS
 
+SOCKET_NAME = "control.sock"
 Seconds = Annotated[float, Field(ge=0, le=1e6)]
 Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
 
@@ -42,6 +44,10 @@ class PortConfig(Section):
     tls: TlsConfig | None = None
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """Port of the Prometheus metrics, on 127.0.0.1 only; absent: none. Set it to monitor the hold."""
+
+    def socket_in(self, logs_dir: Path) -> Path:
+        """The socket's file of a hold with its runs in `logs_dir`."""
+        return Path(self.socket) if self.socket else logs_dir / SOCKET_NAME
 
 
 class AlarmRule(Section):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.toml_file import read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
@@ -159,6 +160,6 @@ def socket_path(where: Where) -> Path:
     if where.socket is not None:
         return where.socket
     if where.run is None:
-        return where.logs / sockets.SOCKET_NAME
+        return where.logs / SOCKET_NAME
     configured = read_toml(where.run / "config.toml").get("port", {}).get("socket")
-    return Path(configured) if configured else where.run.resolve().parent / sockets.SOCKET_NAME
+    return Path(configured) if configured else where.run.resolve().parent / SOCKET_NAME

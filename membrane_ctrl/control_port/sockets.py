@@ -24,7 +24,6 @@ from membrane_ctrl.control_port import endpoint, protocol, session
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
-SOCKET_NAME = "control.sock"
 _MODE = 0o660
 _PATH_BYTES = 107  # of `sun_path`, without its final zero
 _CREDENTIALS = struct.Struct("3i")  # pid, uid, gid of SO_PEERCRED, unix(7)
@@ -238,7 +237,7 @@ def listeners_for(config: PortConfig, logs_dir: Path, stack: contextlib.ExitStac
     """Bind the configured sockets; the stack closes them. Raises InputError or DeviceError."""
     if not config.enabled:
         return Listeners()
-    path = Path(config.socket) if config.socket else logs_dir / SOCKET_NAME
+    path = config.socket_in(logs_dir)
     unix = UnixListener(path, config.group, config.group_role)
     stack.callback(unix.close)
     tls = metrics = None

@@ -9,7 +9,7 @@ import pytest
 from port_run import ROW
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.cli.ctl import ctl_app
+from membrane_ctrl.cli.ctl import add_actions, ctl_app
 from membrane_ctrl.control_port import ctl as port_ctl
 from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
@@ -21,6 +21,7 @@ from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.states import State
 
 ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
+add_actions()
 ACTIONS = [command.name or "" for command in ctl_app.registered_commands]
 Asked = list[dict[str, Any]]
 
