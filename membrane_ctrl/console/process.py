@@ -16,10 +16,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.live import Live
 
+from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import keys, model, why
 from membrane_ctrl.console.view import ConsolePage
-from membrane_ctrl.control_port.sockets import SOCKET_NAME
 from membrane_ctrl.model import events, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import TelemetryRow
