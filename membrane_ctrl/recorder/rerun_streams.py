@@ -8,6 +8,7 @@ import rerun as rr
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import event_words, shape_estimate, telemetry
+from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
@@ -163,7 +164,18 @@ MAP_INTERVAL_S = 600.0
 _NEARLY_ALL = 0.99
 # Zernike terms removed from the maps of change (the mount tilts, the loop holds the bowl's depth), and the least span
 # of their colours, um: noise must not look like a figure.
-_CHANGES = {"difference": (0, 0.5), "difference_no_tilt": (3, 0.5), "difference_no_defocus": (4, 0.1)}
+CHANGES = {"difference": (0, 0.5), "difference_no_tilt": (3, 0.5), "difference_no_defocus": (4, 0.1)}
+
+
+def colour_span(values: AnyArray, least_um: float | None) -> tuple[float, float]:
+    """Range of colours for nearly all of some maps: from 0, or around it if `least_um` is given."""
+    most = float(np.nanquantile(np.abs(values), _NEARLY_ALL))
+    return (0.0, most) if least_um is None else (-max(least_um, most), max(least_um, most))
+
+
+def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
+    """A map, in diverging colours for a range around 0. NaN is drawn as the lowest value: a mask must cover it."""
+    return rr.DepthImage(values, colormap="CyanToYellow" if span[0] < 0 else "Viridis", depth_range=span)
 
 
 class ShapeStreams:
@@ -221,7 +233,7 @@ class ShapeStreams:
         if time_s >= self._next_difference_s:
             self._next_difference_s = time_s + (DIFFERENCE_EARLY_S if early else DIFFERENCE_INTERVAL_S)
             difference_um = shapes.difference_map_um(estimate, reference)
-            for kind, (terms, least_um) in _CHANGES.items():
+            for kind, (terms, least_um) in CHANGES.items():
                 self._send_map(kind, "µm", time_s, shapes.without_terms(difference_um, terms), least_um)
             terms_um = (estimate.coeffs_um - reference.coeffs_um)[1:]
             self._recording.log(shapes.BARS_PATH, time_s, rr.BarChart.from_fields(values=terms_um))
@@ -231,14 +243,9 @@ class ShapeStreams:
         self, kind: str, unit: str, time_s: float, values: shapes.Map, least_um: float | None = None
     ) -> None:
         """Send a map; with `least_um` in diverging colours, which span at least that, around 0."""
-        most = float(np.nanquantile(np.abs(values), _NEARLY_ALL))
-        span = (0.0, most) if least_um is None else (-max(least_um, most), max(least_um, most))
-        # NaN is drawn like the lowest value: a mask covers it (`outside`, sent once per file)
-        picture = rr.DepthImage(
-            values if unit == "mm" else values.astype(np.float16),  # millimetres need more than three digits
-            colormap="Viridis" if least_um is None else "CyanToYellow",
-            depth_range=span,
-        )
+        span = colour_span(values, least_um)
+        # millimetres need more than three digits
+        picture = map_picture(values if unit == "mm" else values.astype(np.float16), span)
         self._recording.log(f"/shape/map/{kind}", time_s, picture)
         self._colours[kind] = f"{'0 to ' if least_um is None else '±'}{span[1]:.3g} {unit}"
 

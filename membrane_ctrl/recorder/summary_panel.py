@@ -21,7 +21,7 @@ def markdown(summary: Mapping[str, Any], status: RunStatus, config: Config) -> s
     Parameters
     ----------
     summary : mapping
-        The content of `summary.json` so far.
+        The content of `summary.json` so far, or when read back: with None for NaN.
     status : RunStatus
         What follows from the events so far.
     config : Config
@@ -56,12 +56,12 @@ def _geometry(geometry: Mapping[str, Any]) -> str:
     return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
 
 
-def _um(value: float, sign: str = "", unit: str = "µm") -> str:
-    return f"{value:{sign}.3g} {unit}" if math.isfinite(value) else ""
+def _um(value: float | None, sign: str = "", unit: str = "µm") -> str:
+    return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
 
 
-def _share(value: float) -> str:
-    return f"{100 * value:.4g} %" if math.isfinite(value) else ""
+def _share(value: float | None) -> str:
+    return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
 
 
 def _span(seconds: float) -> str:

@@ -212,6 +212,17 @@ def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_e
     return _spread(change.height(*_points()) * 1e3)
 
 
+def change_map_um(parameters_um: Column) -> Map:
+    """Height of a change of the 37 parameters (`Shapes.parameters_um`), um, as `height_map_mm`."""
+    return _spread(parameters_um @ _basis())
+
+
+def deviation_map_um(parameters_um: Column) -> Map:
+    """Standard deviation of the height over at least two cycles with (n, 37) parameters, um."""
+    variance = np.einsum("jp,jp->p", _basis(), np.cov(parameters_um.T) @ _basis())
+    return _spread(np.sqrt(np.maximum(variance, 0.0)))
+
+
 def without_terms(height: Map, terms: int) -> Map:
     """A map less its best fit of the first Zernike terms: 3 removes piston and tilt, 4 defocus as well."""
     values, basis = height[_inside()].astype(np.float64), _terms()[:terms]
@@ -258,6 +269,12 @@ def _spread(values: NDArray[np.float64]) -> Map:
     picture = np.full((MAP_PX, MAP_PX), np.nan, dtype=np.float32)
     picture[_inside()] = values
     return picture
+
+
+@cache
+def _basis() -> NDArray[np.float64]:
+    """(37, points) height per unit of each parameter."""
+    return height_basis(*_points())
 
 
 @cache

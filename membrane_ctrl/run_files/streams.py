@@ -180,10 +180,14 @@ def mark_lines(events: Sequence[EventLine]) -> Iterator[tuple[Stream, Column, Fl
     """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical line for each."""
     for stream in MARKS:
         found = [float(event.get("mono_s") or 0.0) for event in events if _mark_kind(event) == stream.lines[0].field]
-        time_s = np.array(found)[:, np.newaxis] + [0.0, 0.0, 1e-9]
-        values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], len(found))
         if found:
-            yield stream, time_s.ravel(), values[:, np.newaxis]
+            yield stream, *vertical_lines(np.array(found))
+
+
+def vertical_lines(time_s: Column) -> tuple[Column, FloatArray]:
+    """Times (3 n,) and values (3 n, 1) that draw a vertical line at each of n times."""
+    values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], time_s.size)
+    return (time_s[:, np.newaxis] + [0.0, 0.0, 1e-9]).ravel(), values[:, np.newaxis]
 
 
 def _mark_kind(event: EventLine) -> str:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
@@ -41,14 +42,16 @@ def times_s(path: Path, entity: str) -> list[float]:
 def test_logs_maps_and_cursor_are_those_of_the_part(
     folder: Path, tmp_path: Path, asked: dict[str, str], from_s: float, to_s: float, cursor_s: float
 ) -> None:
-    file = tmp_path / "r.rrd"
-    assert make_review([open_run(folder)], ReviewOptions([folder], **asked), file) == pytest.approx(cursor_s)
+    file, run = tmp_path / "r.rrd", open_run(folder)
+    cursor = make_review([run], ReviewOptions([folder], **asked), file)
+    assert cursor == viewer.Moment("utc", round(1e9 * (run.origin_utc.timestamp() + cursor_s)))
     assert times_s(file, "/events") == pytest.approx([390.0])
     assert times_s(file, "/found") == pytest.approx([400.0], abs=1.5)
-    maps_s = times_s(file, "/shape/map")
+    maps_s = times_s(file, "/shape/map/difference")
     assert len(maps_s) > 10
     assert from_s <= maps_s[0] <= maps_s[-1] <= to_s
-    assert len(times_s(file, "/found/marks")) == 3  # the plots can be zoomed out
+    lines_s = times_s(file, "/found/lines/pressure_step")  # of the whole run, as the plots can be zoomed out
+    assert lines_s[::3] == pytest.approx([150.0, 400.0, 650.0], abs=1.5)
 
 
 def test_of_a_whole_run_everything_is_there_and_no_moment_was_asked_for(folder: Path, tmp_path: Path) -> None:
@@ -62,7 +65,7 @@ class Client:
     """A viewer that refuses first, then has not opened its file yet."""
 
     calls = 0
-    at_s: float | None = None
+    at_ns: int | None = None
 
     @classmethod
     def connect(cls, _: str) -> Client:
@@ -71,21 +74,20 @@ class Client:
             raise ConnectionError
         return cls()
 
-    def set_time(self, _: str, duration: float, play_state: str) -> None:
-        assert play_state == "paused"
-        Client.at_s = duration if Client.calls >= 3 else None
+    def set_time(self, timeline: str, timestamp: np.datetime64, play_state: str) -> None:
+        assert (timeline, play_state) == ("utc", "paused")
+        Client.at_ns = int(timestamp.astype(np.int64)) if Client.calls >= 3 else None
 
     def get_state(self) -> SimpleNamespace:
-        current = None if Client.at_s is None else round(1e9 * Client.at_s)
-        return SimpleNamespace(recordings=[SimpleNamespace(current_time=current)])
+        return SimpleNamespace(recordings=[SimpleNamespace(current_time=Client.at_ns)])
 
 
 def test_the_cursor_is_put_again_until_it_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "ViewerClient", Client)
     monkeypatch.setattr(viewer, "_CURSOR_AGAIN_S", 0.0)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        viewer.put_cursor(process, 1, 800.25)
-        assert (Client.calls, Client.at_s) == (3, 800.25)
+        viewer.put_cursor(process, 1, viewer.Moment("utc", 800_250_000_001))
+        assert (Client.calls, Client.at_ns) == (3, 800_250_000_001)
         process.communicate(b"\n")
-        viewer.put_cursor(process, 1, 10.0)  # ended meanwhile: nothing to do
+        viewer.put_cursor(process, 1, viewer.Moment("utc", 10))  # ended meanwhile: nothing to do
     assert Client.calls == 3

@@ -214,7 +214,7 @@ def test_the_viewer_is_given_levels_ticks_figure_and_what_was_found(tmp_path: Pa
     rows = entities(tmp_path / "r.rrd")
     assert rows["/loop/error"] >= 7200
     assert rows["/overview/error"] >= 720
-    assert rows["/shape/map"] >= 20
+    assert rows["/shape/map/difference"] >= 20
     assert rows["/found"] >= 1
 
 
@@ -223,9 +223,10 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
     options = ReviewOptions([run.folder for run in runs], start="+100s", end="+110s")
     make_review(runs, options, tmp_path / "r.rrd")
     rows = entities(tmp_path / "r.rrd")
-    assert 100 <= rows["/run_1/loop/error"] <= 102
-    assert 100 <= rows["/run_2/loop/error"] <= 102
-    assert len({tuple(colours(tmp_path / "r.rrd", f"/run_{number}/loop/error")) for number in (1, 2)}) == 2
+    assert 100 <= rows["/20261121T180000Z-n/loop/error"] <= 102
+    assert 100 <= rows["/20261122T180000Z-n/loop/error"] <= 102
+    of_runs = (f"/2026112{number}T180000Z-n/loop/error" for number in (1, 2))
+    assert len({tuple(colours(tmp_path / "r.rrd", path)) for path in of_runs}) == 2
 
 
 @pytest.mark.parametrize(
@@ -301,7 +302,9 @@ def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
     run = open_run(folder)
     for what, at_s in (("pressure", 400.0), ("hold", 0.0), ("end", 720.0), ("pause", 300.0)):
         options = ReviewOptions([folder], around=what)
-        assert make_review([run], options, tmp_path / "r.rrd") == pytest.approx(at_s, abs=2.0)
+        cursor = make_review([run], options, tmp_path / "r.rrd")
+        assert cursor is not None
+        assert cursor.nanos / 1e9 == pytest.approx(run.origin_utc.timestamp() + at_s, abs=2.0)
 
 
 def test_following_a_long_run_begins_some_minutes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

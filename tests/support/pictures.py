@@ -46,11 +46,22 @@ def review_pictures(folder: Path) -> dict[str, bytes]:
     events = [Planted(DOOR, 2500.0, 20.0), Planted(LEAK, 4700.0, 60.0), Planted(GLITCH, 7000.0, 30.0),
               Planted(JUMP, 9000.0, 3.0)]  # fmt: skip
     night = written(folder, 3.0, events)
-    found = {f"review-{tab}": _tab(night, tab) for tab in ("overview", "shape")}
+    (night / "summary.json").unlink()
+    command("repair", night, "--in-place")  # which makes one with all figures
+    found = {f"review-{tab}": _tab(night, night, "--tab", tab) for tab in ("overview", "shape")}
     parts = {"loop": ("--at", "+2500s"), "tuning": ("--from", "+30m", "--to", "+35m")}
-    found |= {f"review-{tab}": _tab(night, tab, *part) for tab, part in parts.items()}
+    found |= {f"review-{tab}": _tab(night, night, "--tab", tab, *part) for tab, part in parts.items()}
     command("report", night, "--out", folder / "report")
     return found | {"report": _page(folder / "report" / "report.html", 800, 3082)}
+
+
+def catalogue_picture(folder: Path) -> dict[str, bytes]:
+    """The table of some nights."""
+    for day, hours in ((21, 0.5), (22, 1.0), (23, 0.2)):
+        night = written(folder, hours, [Planted(DOOR, 500.0, 20.0)], day, f"202611{day}T180000Z-night")
+        (night / "summary.json").unlink()
+        command("repair", night, "--in-place")
+    return {"review-catalogue": _tab(folder, "--all", "--logs", folder)}
 
 
 def faults_picture(folder: Path) -> dict[str, bytes]:
@@ -63,7 +74,7 @@ def faults_picture(folder: Path) -> dict[str, bytes]:
     run = folder / "20261121T180000Z-faults"
     run.mkdir()
     write_record(run, kept_ticks(900.0, blind))
-    return {"review-faults": _tab(run, "faults")}
+    return {"review-faults": _tab(run, run, "--tab", "faults")}
 
 
 def bowed_picture(folder: Path) -> dict[str, bytes]:
@@ -82,9 +93,9 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
     return {"calibration-bowed-screen": (folder / "geometry-residuals.png").read_bytes()}
 
 
-def _tab(run: Path, tab: str, *part: str) -> bytes:
-    target = run.parent / f"{tab}.png"
-    command("review", run, "--tab", tab, *part, "--screenshot", target)
+def _tab(folder: Path, *asked: object) -> bytes:
+    target = folder.parent / "tab.png"
+    command("review", *asked, "--screenshot", target)
     picture = cv2.imread(str(target))
     height_px = round(picture.shape[0] * _WIDTH_PX / picture.shape[1])
     return cv2.imencode(".png", cv2.resize(picture, (_WIDTH_PX, height_px), interpolation=cv2.INTER_AREA))[
@@ -107,6 +118,7 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("run-overview", "run-shape"): run_pictures,
     ("review-overview", "review-loop", "review-shape", "review-tuning", "report"): review_pictures,
     ("review-faults",): faults_picture,
+    ("review-catalogue",): catalogue_picture,
     ("calibration-bowed-screen",): bowed_picture,
 }
 

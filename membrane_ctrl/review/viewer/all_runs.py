@@ -14,7 +14,7 @@ from rerun_bindings import CatalogClientInternal
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint
+from membrane_ctrl.review.viewer.blueprints import COARSE_TABS, ReviewBlueprint
 from membrane_ctrl.review.viewer.layer import APPLICATION, Layer
 from membrane_ctrl.run_files.run import open_run
 
@@ -90,7 +90,7 @@ class RunCatalogue:
         hidden = [Column(f"property:RecordingInfo:{name}", visible=False) for name in ("name", "start_time")]
         started = SortBy("property:run:started_utc", direction="Descending")
         table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
-        runs = ReviewBlueprint(("",), None, Config().limits.band_um, [float("nan")]).made()
+        runs = ReviewBlueprint(("",), "utc", None, Config().limits.band_um).made(tabs=COARSE_TABS)
         table.save(APPLICATION, self._folder / "table.rbl")
         runs.save(APPLICATION, self._folder / "run.rbl")
         self._dataset.register_blueprint((self._folder / "table.rbl").as_uri(), segment_table=True)

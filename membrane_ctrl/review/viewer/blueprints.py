@@ -1,47 +1,54 @@
 """How a review opens: one tab per question, all on the requested time range."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.components import AbsoluteTimeRange
+from rerun.blueprint.encodings import TimelineColumn
+
+from membrane_ctrl.recorder import summary_panel
+from membrane_ctrl.review.viewer.layer import prefix_of
 
 TABS = ("overview", "loop", "shape", "faults", "tuning")
 
 
+# Of the coarse review of a run in the catalogue, which has no ticks.
+COARSE_TABS = ("overview", "shape", "faults")
+
+
+@dataclass(frozen=True, slots=True)
 class ReviewBlueprint:
     """Blueprint of a review.
 
-    Parameters
+    Attributes
     ----------
-    prefixes : sequence of str
-        Before the runs' paths; `("",)` for a single run.
-    span_s : tuple or None
-        Time range to show, on the review's timeline; None: everything.
+    labels : sequence of str
+        Names of the runs; `("",)` for a single one.
+    timeline : str
+        `utc`, or `run_time` for runs aligned at a moment of each.
+    span_ns : tuple or None
+        Time range to show, on that timeline; None: everything.
     band_um : float
         The error plots span three bands.
-    maps_um : sequence of float
-        Scale of each run's maps; NaN without maps.
     """
 
-    def __init__(
-        self, prefixes: Sequence[str], span_s: tuple[float, float] | None, band_um: float, maps_um: Sequence[float]
-    ) -> None:
-        self._prefixes = prefixes
-        self._span_s = span_s
-        self._error_span_um = (-3 * band_um, 3 * band_um)
-        self._maps_um = maps_um
+    labels: Sequence[str]
+    timeline: str
+    span_ns: tuple[int, int] | None
+    band_um: float
 
-    def made(self, tab: str = "overview") -> rrb.Blueprint:
-        """The blueprint, with `tab` (one of `TABS`) selected."""
-        tabs = [self._overview(), self._loop(), self._shape(), self._faults(), self._tuning()]
-        selection = None
-        if self._span_s is not None:
-            start, end = (round(1e9 * second) for second in self._span_s)
-            selection = AbsoluteTimeRange(start, end)
+    def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
+        """The blueprint, with some of `TABS`, `tab` selected."""
+        makers = {
+            "overview": self._overview, "loop": self._loop, "shape": self._shape, "faults": self._faults,
+            "tuning": self._tuning,
+        }  # fmt: skip
+        selection = None if self.span_ns is None else AbsoluteTimeRange(*self.span_ns)
         return rrb.Blueprint(
-            rrb.Tabs(*tabs, active_tab=TABS.index(tab)),
-            rrb.TimePanel(state="collapsed", timeline="run_time", time_selection=selection),
+            rrb.Tabs(*(makers[name]() for name in tabs), active_tab=tabs.index(tab)),
+            rrb.TimePanel(state="collapsed", timeline=self.timeline, time_selection=selection),
             rrb.SelectionPanel(state="collapsed"),
             rrb.BlueprintPanel(state="collapsed"),
             auto_views=False,
@@ -49,12 +56,12 @@ class ReviewBlueprint:
 
     def _axis(self) -> rrb.TimeAxis:
         start, end = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
-        if self._span_s is not None:
-            start, end = (rr.TimeRangeBoundary.absolute(seconds=second) for second in self._span_s)
+        if self.span_ns is not None:
+            start, end = (rr.TimeRangeBoundary.absolute(nanos=nanos) for nanos in self.span_ns)
         return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
     def _contents(self, paths: Sequence[str]) -> list[str]:
-        return [f"+ {prefix}{path}" for prefix in self._prefixes for path in paths]
+        return [f"+ {prefix_of(label)}{path}" for label in self.labels for path in paths]
 
     def _plot(self, name: str, *paths: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
@@ -63,62 +70,99 @@ class ReviewBlueprint:
             contents=self._contents(paths),
             axis_x=self._axis(),
             axis_y=None if span is None else rrb.ScalarAxis(range=span),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),  # over the oldest data
         )
 
+    def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
+        """A plot of the error, with lines where something happened: these would stretch an axis of no fixed span."""
+        span_um = (-3 * self.band_um, 3 * self.band_um)
+        return self._plot(name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um)
+
     def _error(self) -> rrb.TimeSeriesView:
-        paths = ("/overview/error", "/overview/true", "/loop/band", "/found/marks")
-        return self._plot("Error: minimum, mean, maximum; red: detected, um", *paths, span=self._error_span_um)
+        return self._around_band("Error: minimum, mean, maximum, µm", "/overview/error", "/overview/true")
 
     def _lanes(self) -> rrb.StateTimelineView:
-        several = len(self._prefixes) > 1  # there is room for two lanes of each
+        several = len(self.labels) > 1  # there is room for two lanes of each
         paths = ("/state/controller", "/state/fault", *(() if several else ("/state/shape_loop", "/state/rung")))
         return rrb.StateTimelineView(
             name="States", origin="/", contents=self._contents(paths), time_view=self._axis()
         )  # fmt: skip
 
     def _log(self, name: str, *paths: str) -> rrb.TextLogView:
-        columns = rrb.TextLogColumns(timeline_columns=["run_time"], text_log_columns=["loglevel", "body"])
-        return rrb.TextLogView(name=name, origin="/", contents=self._contents(paths), columns=columns)
+        hidden = TimelineColumn(self.timeline, visible=False)  # too narrow to read: the lines begin with it
+        return rrb.TextLogView(
+            name=name,
+            origin="/",
+            contents=self._contents(paths),
+            columns=rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["loglevel", "body"]),
+            format_options=rrb.TextLogFormat(monospace_body=False),
+        )
+
+    def _pages(self) -> rrb.Tabs:
+        """A page of figures for each run."""
+        names = [label or "Summary" for label in self.labels]
+        origins = [prefix_of(label) + summary_panel.PATH for label in self.labels]
+        return rrb.Tabs(
+            *(rrb.TextDocumentView(name=n, origin=o) for n, o in zip(names, origins, strict=True)), active_tab=0
+        )
 
     def _overview(self) -> rrb.Vertical:
-        return rrb.Vertical(
+        plots = rrb.Vertical(
             self._error(),
             self._lanes(),
             rrb.Horizontal(
-                self._plot("Flow and leak, um/s", "/overview/flow"),
+                self._plot("Flow and leak, µm/s", "/overview/flow"),
                 self._plot("Air pressure, Pa", "/overview/ambient"),
-                self._plot("Air temperature, C", "/overview/temperature"),
+                self._plot("Air temperature, °C", "/overview/temperature"),
             ),
+            row_shares=[3.6, 2.5, 2],
+        )
+        return rrb.Vertical(
+            rrb.Horizontal(plots, self._pages(), column_shares=[3.4, 1]),
             rrb.Horizontal(self._log("Detected events, UTC", "/found"), self._log("Events, UTC", "/events")),
-            row_shares=[3.6, 2.7, 1.9, 1.8],
+            row_shares=[4.2, 1],
             name="overview",
         )
 
     def _loop(self) -> rrb.Vertical:
         return rrb.Vertical(
-            self._plot("Error, each tick, um (shown for short runs, or with --from and --to)", "/loop/error",
-                       "/loop/band", span=self._error_span_um),
-            self._plot("Setpoint, reading, true centre, um", "/loop/position", "/truth/displacement"),
-            self._plot("P, I, D, feed-forward, um/s", "/loop/terms"),
-            self._plot("Flow and leak, um/s", "/loop/flow"),
+            self._around_band("Error, each tick, µm (shown for short runs, or with --from and --to)", "/loop/error"),
+            self._plot("Setpoint, reading, true centre, µm", "/loop/position", "/truth/displacement"),
+            self._plot("P, I, D, feed-forward, µm/s", "/loop/terms"),
+            self._plot("Flow and leak, µm/s", "/loop/flow"),
             self._plot("Pump and vent", "/pump/drive"),
+            row_shares=[3, 2, 2, 2, 2],
             name="loop",
-        )  # fmt: skip
+        )
 
     def _shape(self) -> rrb.Vertical:
-        maps = [
-            rrb.Spatial2DView(name=_map_name(prefix.strip("/"), most_um), origin=f"{prefix}/shape/map")
-            for prefix, most_um in zip(self._prefixes, self._maps_um, strict=True)
-        ]
-        return rrb.Vertical(
-            rrb.Horizontal(*maps, self._plot("Low orders, change, um", "/shape/change")),
-            self._plot("Change of the centre by camera and by laser, um", "/shape/sag_change"),
+        rows = [self._maps(label) for label in self.labels]
+        plots = [
             rrb.Horizontal(
-                self._plot("Slope residual, urad", "/shape/residual"), self._plot("Trim, um", "/overview/trim")
+                self._plot("Change of the centre by camera (± 1σ) and laser, µm", "/shape/sag_change"),
+                self._plot("Low orders, change ± 1σ, µm", "/shape/change"),
             ),
-            row_shares=[3, 2, 1.5],
-            name="shape",
+            rrb.Horizontal(
+                self._plot("Slope residual, µrad", "/shape/residual"), self._plot("Trim, µm", "/overview/trim")
+            ),
+        ]
+        return rrb.Vertical(*rows, *plots, row_shares=[3] * len(rows) + [2.5, 1.5], name="shape")
+
+    def _maps(self, label: str) -> rrb.Horizontal:
+        def view(kind: str, name: str) -> rrb.Spatial2DView:
+            return rrb.Spatial2DView(name=f"{label} {name}".strip(), origin=f"{prefix_of(label)}/shape/map/{kind}")
+
+        less = rrb.Tabs(
+            view("difference_no_defocus", "Less piston, tilt, defocus"),
+            view("difference_no_tilt", "Less piston, tilt"),
+            active_tab=0,
+        )
+        return rrb.Horizontal(
+            view("difference", "Change since the hold's first cycle"),
+            less,
+            view("scatter", "Standard deviation"),
+            rrb.TextDocumentView(name="Colours", origin=f"{prefix_of(label)}/shape/legend"),
+            column_shares=[1, 1, 1, 0.8],
         )
 
     def _faults(self) -> rrb.Vertical:
@@ -136,20 +180,13 @@ class ReviewBlueprint:
         )
 
     def _tuning(self) -> rrb.Vertical:
-        paths = ("/loop/error", "/truth/displacement", "/loop/band")
         return rrb.Vertical(
-            self._plot("Reading, filtered, setpoint, um", "/loop/position"),
-            self._plot("True and measured error, um", *paths, span=self._error_span_um),
+            self._plot("Reading, filtered, setpoint, µm", "/loop/position"),
+            self._around_band("True and measured error, µm", "/loop/error", "/truth/error"),
             rrb.Horizontal(
-                self._plot("P, I, D, feed-forward, um/s", "/loop/terms"),
-                self._plot("Flow wanted and given, um/s", "/loop/flow"),
+                self._plot("P, I, D, feed-forward, µm/s", "/loop/terms"),
+                self._plot("Flow wanted and given, µm/s", "/loop/flow"),
             ),
             self._plot("Time between ticks, s", "/tick/dt"),
             name="tuning",
         )
-
-
-def _map_name(run: str, most_um: float) -> str:
-    """The map's name includes its colour scale, which the viewer does not draw."""
-    scale = f", um: blue {-most_um:.2g}, green 0, red {most_um:+.2g}" if most_um == most_um else ""
-    return f"{run} Height since the hold's first cycle{scale}".strip()

@@ -1,5 +1,6 @@
 """`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time."""
 
+import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -52,26 +53,26 @@ def review_command(options: ReviewOptions) -> int:
                 _require_writable(target, runs)
         file = options.save or Path(folder) / "review.rrd"
         try:
-            cursor_s = make_review(runs, options, file)
+            cursor = make_review(runs, options, file)
         finally:
             for run in runs:
                 for note in run.notes:
                     print(f"note: {run.name}: {note}", file=sys.stderr)
-        return _show(file, options, cursor_s)
+        return _show(file, options, cursor)
 
 
-def _show(file: Path, options: ReviewOptions, cursor_s: float | None) -> int:
+def _show(file: Path, options: ReviewOptions, cursor: viewer.Moment | None) -> int:
     if options.screenshot is not None:
-        return _picture(options.screenshot, file, cursor_s)
+        return _picture(options.screenshot, file, cursor)
     if options.save is not None:
         print(file)
         return 0
-    return viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor_s)
+    return viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor)
 
 
-def _picture(target: Path, source: Path | str, cursor_s: float | None = None) -> int:
+def _picture(target: Path, source: Path | str, cursor: viewer.Moment | None = None) -> int:
     try:
-        target.write_bytes(viewer.screenshot_of(source, cursor_s))
+        target.write_bytes(viewer.screenshot_of(source, cursor))
     except RuntimeError as error:
         raise errors.DeviceError(f"no picture: {error}") from None
     return 0
@@ -134,7 +135,7 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
             target.unlink()
 
 
-def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> float | None:
+def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> viewer.Moment | None:
     """Write the recording that the viewer opens.
 
     Raises InputError if the first run lacks a requested time or event, or no run has telemetry.
@@ -148,27 +149,36 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> floa
 
     Returns
     -------
-    float or None
-        Requested second of the timeline: the given time, or the start of the part.
+    viewer.Moment or None
+        Where to put the time cursor: the requested moment, or the start of the part.
     """
     runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)
     zeros_s = _zeros(runs, options.align)
-    prefixes = ("",) if len(runs) == 1 else tuple(f"/run_{number}" for number in range(1, len(runs) + 1))
-    layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(run.name for run in runs))
-    shown = None if span_s is None else (span_s[0] - zeros_s[0], span_s[1] - zeros_s[0])
-    maps_um = []
-    for run, prefix, zero_s in zip(runs, prefixes, zeros_s, strict=True):
-        part_s = ALL if shown is None else (shown[0] + zero_s, shown[1] + zero_s)
-        maps_um.append(layer.add(run, prefix, zero_s, part_s))
-        if prefix:
-            print(f"{prefix.strip('/')} is {run.name}", file=sys.stderr)
-    blueprint = blueprints.ReviewBlueprint(prefixes, shown, runs[0].config.limits.band_um, maps_um)
+    labels = labels_of([run.name for run in runs])
+    layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
+    for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
+        part_s = ALL if span_s is None else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
+        layer.add(run, label, zero_s, part_s)
+    by_clock = len(runs) == 1 or options.align == "utc"
+    timeline = "utc" if by_clock else "run_time"
+    zero_ns = round(1e9 * runs[0].origin_utc.timestamp()) if by_clock else -round(1e9 * zeros_s[0])
+    shown_ns = None if span_s is None else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
+    blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config.limits.band_um)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
-    if shown is None:
+    if shown_ns is None:
         return None
-    return shown[0] if options.start or options.end else (shown[0] + shown[1]) / 2
+    return viewer.Moment(timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2)
+
+
+def labels_of(names: Sequence[str]) -> list[str]:
+    """Names of overlaid runs, without the times of their starts if they differ even so; empty for a single run."""
+    if len(names) == 1:
+        return [""]
+    short = [re.sub(r"^\d{8}T\d{6}Z-(?=.)", "", name) for name in names]
+    names = short if len(set(short)) == len(names) else names
+    return [name if names.count(name) == 1 else f"{name} ({place})" for place, name in enumerate(names, 1)]
 
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:

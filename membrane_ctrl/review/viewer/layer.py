@@ -6,22 +6,23 @@ figure with maps; states; events, marks and detected events.
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
 
+from membrane_ctrl.model import event_words, run_status
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
-from membrane_ctrl.model.event_words import level, sentence
 from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import FIELDS, changes
+from membrane_ctrl.recorder import rerun_streams, summary_panel
 from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
 from membrane_ctrl.review.words import end_s
-from membrane_ctrl.run_files import streams, summary
+from membrane_ctrl.run_files import shapes, streams, summary
 from membrane_ctrl.run_files.run import Block, Run
-from membrane_ctrl.run_files.shapes import Shapes, height_basis
 
 APPLICATION = "membrane_review"
 # The viewer draws about this many rows of a dozen signals without stutter in software.
@@ -30,33 +31,43 @@ LEVEL_ROWS_MOST = 50_000
 OVERVIEW_ROWS_MOST = 5_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
-_MAP_PX = 96
 _RUN_COLOURS: tuple[streams.Colour, ...] = (streams.BLUE, streams.ORANGE, streams.GREEN, streams.VIOLET, streams.RED)
 
 
 # Plots of a level: signals (column, name, colour) by path.
 OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
     "/overview/error": (
-        ("min_error_um", "error, minimum um", streams.GREY),
-        ("mean_error_um", "error, mean um", streams.BLUE),
-        ("max_error_um", "error, maximum um", streams.GREY),
+        ("min_error_um", "error, minimum µm", streams.GREY),
+        ("mean_error_um", "error, mean µm", streams.BLUE),
+        ("max_error_um", "error, maximum µm", streams.GREY),
     ),
-    "/overview/true": (("mean_true_error_um", "true error, mean um", streams.GREEN),),
+    "/overview/true": (("mean_true_error_um", "true error, mean µm", streams.GREEN),),
     "/overview/flow": (
-        ("mean_flow_um_per_s", "flow um/s", streams.BLUE),
-        ("mean_leak_um_per_s", "leak um/s", streams.RED),
+        ("mean_flow_um_per_s", "flow µm/s", streams.BLUE),
+        ("mean_leak_um_per_s", "leak µm/s", streams.RED),
     ),
     "/overview/pump": (("mean_pump_fraction", "pump", streams.BLUE),),
-    "/overview/trim": (("mean_trim_um", "trim um", streams.VIOLET),),
+    "/overview/trim": (("mean_trim_um", "trim µm", streams.VIOLET),),
     "/overview/ambient": (("mean_ambient_pressure_pa", "air pressure Pa", streams.BLUE),),
     "/overview/gauge": (("mean_gauge_pressure_pa", "gauge pressure Pa", streams.BLUE),),
-    "/overview/temperature": (("mean_air_temperature_c", "air C", streams.ORANGE),),
+    "/overview/temperature": (("mean_air_temperature_c", "air °C", streams.ORANGE),),
     "/overview/lateness": (
         ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
         ("max_lateness_ms", "lateness, maximum ms", streams.GREY),
     ),
     "/overview/missed": (("max_missed_ticks", "ticks missed so far", streams.RED),),
 }
+
+
+_COLOUR_WORDS = (
+    "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
+)
+_SIGNED = {"Pa", "um", "%"}
+_OTHER_FOUND: streams.Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
+_FOUND_COLOURS = {
+    "pressure step": streams.VIOLET, "leak step": streams.ORANGE, "noise change": streams.ORANGE,
+    "shape jump": streams.BLUE,
+}  # fmt: skip
 
 
 ALL = (-np.inf, np.inf)
@@ -84,21 +95,21 @@ class Layer:
         self._stream.flush()
         self._stream.disconnect()
 
-    def add(self, run: Run, prefix: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL) -> float:
-        """Add a run; returns the scale of its maps: their largest change of height, um; NaN without maps.
+    def add(self, run: Run, label: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL) -> None:
+        """Add a run.
 
         Parameters
         ----------
-        prefix : str
-            Before its paths; empty for a single run.
+        label : str
+            Name among several runs; empty for a single one.
         zero_s : float
             Second of the run at 0 on the timeline.
         part_s : tuple
             Requested part: shown tick by tick unless too long; logs and maps hold only this part, as otherwise a
             cursor at the end of the recording would show those of the end.
         """
-        self._prefix, self._shift_s = prefix, zero_s
-        self._label = f"{prefix.strip('/')} " if prefix else ""
+        self._prefix, self._shift_s = prefix_of(label), zero_s
+        self._label = f"{label}: " if label else ""
         self._number += 1
         self._origin = np.datetime64(run.origin_utc.replace(tzinfo=None), "ns")
         span_s = _end_s(run)
@@ -106,14 +117,15 @@ class Layer:
         level_s = next((w for w in (1.0, 10.0) if span_s / w <= rows_most), 60.0)
         level = run.level(level_s)
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
-        shapes = run.shapes()
-        found = find_events(seconds, shapes, run.config.limits.band_um)
+        cycles = run.shapes()
+        found = find_events(seconds, cycles, run.config.limits.band_um)
+        self._page(summary_panel.PATH, _summary_page(run))
         self._overviews(level, run.config.limits.band_um)
         if not self._overview_only:
             self._ticks(run, part_s)
         self._lanes(level)
         self._events(run, found, part_s)
-        return self._figure(shapes.select(summary.held_at(level, shapes.time_s)), part_s)
+        self._figure(cycles.select(summary.held_at(level, cycles.time_s)), part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
         for path, lines in OVERVIEWS.items():
@@ -122,8 +134,9 @@ class Layer:
                 self._style(path, [(name, colour) for _, name, colour in lines])
                 self._scalars(path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
-        self._style("/loop/band", [("+band um", streams.GREY), ("-band um", streams.GREY)])
-        self._scalars("/loop/band", ends, np.tile([band_um, -band_um], (ends.size, 1)))
+        band = streams.band(band_um)
+        square = np.full((ends.size, 1), band_um**2)
+        self._measured(band.path, [(band.lines[0].name, streams.GREEN)], ends, np.zeros_like(square), square, 0.0)
 
     def _ticks(self, run: Run, part_s: tuple[float, float]) -> None:
         rows_expected = run.config.loop.rate_hz * (min(part_s[1], _end_s(run)) - max(part_s[0], 0.0))
@@ -151,16 +164,24 @@ class Layer:
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
         told = [e for e in run.log if not isinstance(e.event, Why) and part_s[0] <= e.mono_s <= part_s[1]]
         if told:
-            times = np.array([each.mono_s for each in told])
-            self._log(run, "/events", times, [sentence(e.line) for e in told], [level(e.line) for e in told])
+            levels = [event_words.level(each.line) for each in told]
+            texts = [event_words.sentence(each.line) for each in told]
+            self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
+        for stream, time_s, values in streams.mark_lines([{**each.line, "mono_s": each.mono_s} for each in run.log]):
+            self._style(stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True)
+            self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
-            texts = [f"{f.kind}: {f.size:.3g} {f.unit} (confidence {f.confidence:.3f})" for f in seen]
+            texts = [f"{f.kind}, {_size(f.size, f.unit)} (confidence {f.confidence:.3f})" for f in seen]
             self._log(run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen))
-        if found:
-            times = np.array([f.time_s for f in found])
-            self._style("/found/marks", [("detected", streams.RED)], points=True)
-            self._scalars("/found/marks", times, np.zeros((len(found), 1)))
+        for kind in dict.fromkeys(f.kind for f in found):
+            alike = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
+            ends = " to ".join(dict.fromkeys(_size(f.size, f.unit) for f in (alike[0], alike[-1])))
+            name = f"{kind}, {ends}" if len(alike) == 1 else f"{len(alike)} of {kind}, {ends}"
+            path = f"/found/lines/{kind.replace(' ', '_')}"
+            self._style(path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True)
+            time_s, values = streams.vertical_lines(np.array([f.time_s for f in alike]))
+            self._columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
         """Log lines that begin with the time of day."""
@@ -169,53 +190,89 @@ class Layer:
         ]
         self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
-    def _figure(self, shapes: Shapes, part_s: tuple[float, float]) -> float:
-        good = shapes.select((shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
+    def _figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
+        """Changes since the first cycle of the hold."""
+        good = cycles.select((cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1))
         if not len(good):
-            return float("nan")
+            return
         shown = good.select(_some(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
-        terms = list(streams.LOW_ORDERS)
-        self._style("/shape/change", [streams.LOW_ORDERS[j] for j in terms])
-        self._scalars("/shape/change", shown.time_s, parameters[:, [j - 1 for j in terms]])
-        self._style("/shape/sag_change", [("sag by the camera um", streams.BLUE), ("laser um", streams.ORANGE)])
+        terms = [j - 1 for j in streams.LOW_ORDERS]
+        variances = _variances(shown)[:, terms]
+        self._measured("/shape/change", streams.LOW_ORDERS.values(), shown.time_s, parameters[:, terms], variances)
         change = np.column_stack((shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0]))
-        self._scalars("/shape/sag_change", shown.time_s, change)
-        self._style("/shape/residual", [("slope residual urad", streams.BLUE)])
+        variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
+        lines = [(line.name, line.colour) for line in streams.SAG.lines]
+        self._measured("/shape/sag_change", lines, shown.time_s, change, variances)
+        self._style("/shape/residual", [("slope residual µrad", streams.BLUE)])
         self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
-        return self._maps(shown.time_s[seen], parameters[seen])
+        self._maps(shown.time_s[seen], parameters[seen])
 
-    def _maps(self, time_s: Column, parameters: Column) -> float:
-        """Height changes since the first cycle of the hold, on a common scale for playback."""
-        axis = (np.arange(_MAP_PX) + 0.5) * 2 / _MAP_PX - 1
-        x, y = np.meshgrid(axis, -axis)
-        inside = np.hypot(x, y) <= 1.0
-        wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
-        heights = parameters[wanted] @ height_basis(x[inside], y[inside])
-        most = max(0.5, float(np.abs(heights).max()))
+    def _maps(self, time_s: Column, parameters: Column) -> None:
+        """Maps of change, each kind on one scale for playback, and of the standard deviation over the part."""
         context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
         self._stream.log(self._prefix + "/shape", context, static=True)
-        outside = rr.SegmentationImage((~inside).astype(np.uint8), opacity=1.0, draw_order=1.0)
-        self._stream.log(self._prefix + "/shape/map/outside", outside, static=True)
-        for row, height in zip(wanted, heights, strict=True):
-            picture = np.zeros((_MAP_PX, _MAP_PX), dtype=np.float32)
-            picture[inside] = height
-            image = rr.DepthImage(picture, colormap="turbo", depth_range=(-most, most))
-            at_s = np.array([time_s[row]])
-            self._stream.set_time("run_time", duration=_nanoseconds(at_s - self._shift_s)[0])
-            self._stream.set_time("utc", timestamp=self._origin + _nanoseconds(at_s)[0])
-            self._stream.log(self._prefix + "/shape/map", image)
-        return most
+        colours = {}
+        if time_s.size > 1:
+            deviation = shapes.deviation_map_um(parameters)
+            span = rerun_streams.colour_span(deviation, None)
+            self._map("scatter", deviation, span)
+            colours["scatter"] = f"0 to {span[1]:.2g} µm"
+        wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
+        whole = [shapes.change_map_um(parameters[row]) for row in wanted]
+        for kind, (terms, least_um) in rerun_streams.CHANGES.items():
+            changes = [shapes.without_terms(change, terms) for change in whole]
+            span = rerun_streams.colour_span(np.stack(changes), least_um)
+            colours[kind] = f"±{span[1]:.2g} µm"
+            for row, change in zip(wanted, changes, strict=True):
+                self._map(kind, change, span, float(time_s[row]))
+        rows = "".join(
+            f"| {shapes.MAPS[kind].replace(' so far', '')} | {words} |\n" for kind, words in colours.items()
+        )
+        self._page("/shape/legend", f"| map | colours |\n|---|---|\n{rows}\n{_COLOUR_WORDS}")
 
-    def _style(self, path: str, lines: Iterable[tuple[str, streams.Colour]], points: bool = False) -> None:
+    def _map(self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None) -> None:
+        """Log a map at a second of the run, or for all of it."""
+        path, picture = f"{self._prefix}/shape/map/{kind}", values.astype(np.float16)
+        outside = rr.SegmentationImage(shapes.outside_disc(), opacity=1.0, draw_order=1.0)
+        self._stream.log(f"{path}/outside", outside, static=True)
+        if at_s is not None:
+            since = _nanoseconds(np.array([at_s - self._shift_s, at_s]))
+            self._stream.set_time("run_time", duration=since[0])
+            self._stream.set_time("utc", timestamp=self._origin + since[1])
+        self._stream.log(path, rerun_streams.map_picture(picture, span), static=at_s is None)
+
+    def _page(self, path: str, text: str) -> None:
+        self._stream.log(self._prefix + path, rr.TextDocument(text, media_type="text/markdown"), static=True)
+
+    def _named(self, lines: Iterable[tuple[str, streams.Colour]], width: float) -> dict[str, Any]:
+        """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs apart."""
         names, colours = zip(*lines, strict=True)
-        style = rr.SeriesPoints if points else rr.SeriesLines
         if self._prefix:
             colours = tuple(_of_run(colour, self._number) for colour in colours)
-        archetype = style(names=[self._label + name for name in names], colors=list(colours))
-        self._stream.log(self._prefix + path, archetype, static=True)
+        return {
+            "names": [self._label + name for name in names], "colors": list(colours), "widths": [width] * len(names)
+        }  # fmt: skip
+
+    def _style(
+        self, path: str, lines: Iterable[tuple[str, streams.Colour]], width: float = 1.5, vertical: bool = False
+    ) -> None:
+        # the average of the lines in a pixel would be none
+        style = rr.SeriesLines(**self._named(lines, width), aggregation_policy="Off" if vertical else None)
+        self._stream.log(self._prefix + path, style, static=True)
+
+    def _measured(
+        self, path: str, lines: Iterable[tuple[str, streams.Colour]], time_s: Column, values: Column,
+        variances: Column, width: float = 1.5,
+    ) -> None:  # fmt: skip
+        """Log values with a shaded area of one standard deviation."""
+        style = rr.Measurements.from_fields(**self._named(lines, width))
+        self._stream.log(self._prefix + path, style, static=True)
+        drawn = broken_at_gaps({"time_s": time_s, "values": values, "variances": variances})
+        columns = rr.Measurements.columns(values=drawn["values"], variances=drawn["variances"])
+        self._columns(path, drawn["time_s"], columns)
 
     def _scalars(self, path: str, time_s: Column, values: Column) -> None:
         if time_s.size:
@@ -228,6 +285,36 @@ class Layer:
             rr.TimeColumn("utc", timestamp=self._origin + _nanoseconds(time_s)),
         ]
         self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
+
+
+def prefix_of(label: str) -> str:
+    """Before the paths of a run among several."""
+    return f"/{rr.escape_entity_path_part(label)}" if label else ""
+
+
+def _summary_page(run: Run) -> str:
+    """The page of figures as the recorder wrote it last, from `summary.json`: what `runs` and `report` state."""
+    status = run_status.RunStatus()
+    for each in run.log:
+        status = status.after_event(each.event, each.mono_s)
+    try:
+        page = summary_panel.markdown(run.summary or {}, status, run.config)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
+        page = "`summary.json` is missing, damaged or of an earlier version.\n"
+    name = event_words.for_people(run.name)
+    return f"**{name}**\n\n{page}\nIntervals and spectra: `membrane-ctrl report {name}`\n"
+
+
+def _size(size: float, unit: str) -> str:
+    return event_words.for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
+
+
+def _variances(cycles: shapes.Shapes) -> Column:
+    """(n, 36) variances of the coefficients, of the covariance recorded last before each cycle; 0 without any."""
+    if not cycles.covariance_time_s.size:
+        return np.zeros_like(cycles.coeffs_um)
+    place = np.searchsorted(cycles.covariance_time_s, cycles.time_s, side="right") - 1
+    return np.diagonal(cycles.covariance_um2, axis1=1, axis2=2)[np.maximum(place, 0)]
 
 
 def _of_run(colour: streams.Colour, number: int) -> streams.Colour:

@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TypeAlias
 from urllib.parse import quote, urlsplit
 
+import numpy as np
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
@@ -33,28 +35,43 @@ _RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as recorded
 _STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
 
 
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A time on a timeline: nanoseconds since 1970 on `utc`, else since its 0."""
+
+    timeline: str
+    nanos: int
+
+
+def _put(client: ViewerClient, at: Moment) -> None:
+    if at.timeline == "utc":
+        client.set_time(at.timeline, timestamp=np.datetime64(at.nanos, "ns"), play_state="paused")
+    else:
+        client.set_time(at.timeline, duration=np.timedelta64(at.nanos, "ns"), play_state="paused")
+
+
 def viewer_command(*arguments: str) -> list[str]:
     """The viewer's binary: the `rerun` command is a Python shim, and ending that would leave the viewer running."""
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(source: Path | str, at_s: float | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
+def show(source: Path | str, at: Moment | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
     """Open a file or a server's page on this machine's screen; return when the window is closed.
 
-    The cursor is put at a second of `run_time`; `meanwhile` runs while the window is open and ends with it.
+    The cursor is put at a moment; `meanwhile` runs while the window is open and ends with it.
     """
     _require_screen()
     port = free_port()
 
     def started(process: subprocess.Popen[bytes]) -> None:
-        if at_s is not None:
-            put_cursor(process, port, at_s)
+        if at is not None:
+            put_cursor(process, port, at)
         meanwhile(lambda: process.poll() is None)
 
     return _run(viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started)
 
 
-def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s: float = _CURSOR_S) -> None:
+def put_cursor(process: subprocess.Popen[bytes], port: int, at: Moment, most_s: float = _CURSOR_S) -> None:
     """Set a viewer's time cursor once its files are open, which a blueprint cannot do.
 
     A viewer that does not answer in time is left unchanged: its plots show the requested part anyway.
@@ -63,8 +80,8 @@ def put_cursor(process: subprocess.Popen[bytes], port: int, at_s: float, most_s:
     while time.monotonic() < until_s and process.poll() is None:
         try:
             client = ViewerClient.connect(_proxy("127.0.0.1", port))
-            client.set_time("run_time", duration=at_s, play_state="paused")
-            if any(opened.current_time == round(1e9 * at_s) for opened in client.get_state().recordings):
+            _put(client, at)
+            if any(opened.current_time == at.nanos for opened in client.get_state().recordings):
                 return
         except (RuntimeError, ConnectionError):
             pass
@@ -253,8 +270,8 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
         return _at_rest(viewer)
 
 
-def screenshot_of(source: Path | str, at_s: float | None = None) -> bytes:
-    """PNG of a recording as it opens, at a second of `run_time` or its end, or of a server's page.
+def screenshot_of(source: Path | str, at: Moment | None = None) -> bytes:
+    """PNG of a recording as it opens, at a moment or its end, or of a server's page.
 
     Raises RuntimeError as `screenshot`.
     """
@@ -262,10 +279,10 @@ def screenshot_of(source: Path | str, at_s: float | None = None) -> bytes:
         viewer.open(source if isinstance(source, str) else str(source.resolve()))
         if isinstance(source, str):
             pass
-        elif at_s is None:
-            viewer.set_time("run_time", play_state="following")
+        elif at is None:
+            viewer.set_time(play_state="following")
         else:
-            viewer.set_time("run_time", duration=at_s, play_state="paused")
+            _put(viewer, at)
         return _at_rest(viewer)
 
 
