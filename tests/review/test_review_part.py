@@ -44,7 +44,7 @@ def test_logs_maps_and_cursor_are_those_of_the_part(
 ) -> None:
     file, run = tmp_path / "r.rrd", open_run(folder)
     cursor = make_review([run], ReviewOptions([folder], **asked), file)
-    assert cursor == viewer.Moment("utc", round(1e9 * (run.origin_utc.timestamp() + cursor_s)))
+    assert cursor == viewer.CursorTime("utc", round(1e9 * (run.origin_utc.timestamp() + cursor_s)))
     assert times_s(file, "/events") == pytest.approx([390.0])
     assert times_s(file, "/found") == pytest.approx([400.0], abs=1.5)
     maps_s = times_s(file, "/shape/map/difference")
@@ -86,8 +86,8 @@ def test_the_cursor_is_put_again_until_it_stands_there(monkeypatch: pytest.Monke
     monkeypatch.setattr(viewer, "ViewerClient", Client)
     monkeypatch.setattr(viewer, "_CURSOR_AGAIN_S", 0.0)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        viewer.put_cursor(process, 1, viewer.Moment("utc", 800_250_000_001))
+        viewer.put_cursor(process, 1, viewer.CursorTime("utc", 800_250_000_001))
         assert (Client.calls, Client.at_ns) == (3, 800_250_000_001)
         process.communicate(b"\n")
-        viewer.put_cursor(process, 1, viewer.Moment("utc", 10))  # ended meanwhile: nothing to do
+        viewer.put_cursor(process, 1, viewer.CursorTime("utc", 10))  # ended meanwhile: nothing to do
     assert Client.calls == 3

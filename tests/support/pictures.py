@@ -48,9 +48,9 @@ def review_pictures(folder: Path) -> dict[str, bytes]:
     night = written(folder, 3.0, events)
     (night / "summary.json").unlink()
     command("repair", night, "--in-place")  # which makes one with all figures
-    found = {f"review-{tab}": _tab(night, night, "--tab", tab) for tab in ("overview", "shape")}
+    found = {f"review-{tab}": _tab(folder, night, "--tab", tab) for tab in ("overview", "shape")}
     parts = {"loop": ("--at", "+2500s"), "tuning": ("--from", "+30m", "--to", "+35m")}
-    found |= {f"review-{tab}": _tab(night, night, "--tab", tab, *part) for tab, part in parts.items()}
+    found |= {f"review-{tab}": _tab(folder, night, "--tab", tab, *part) for tab, part in parts.items()}
     command("report", night, "--out", folder / "report")
     return found | {"report": _page(folder / "report" / "report.html", 800, 3082)}
 
@@ -74,7 +74,7 @@ def faults_picture(folder: Path) -> dict[str, bytes]:
     run = folder / "20261121T180000Z-faults"
     run.mkdir()
     write_record(run, kept_ticks(900.0, blind))
-    return {"review-faults": _tab(run, run, "--tab", "faults")}
+    return {"review-faults": _tab(folder, run, "--tab", "faults")}
 
 
 def bowed_picture(folder: Path) -> dict[str, bytes]:
@@ -94,7 +94,7 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
 
 
 def _tab(folder: Path, *asked: object) -> bytes:
-    target = folder.parent / "tab.png"
+    target = folder / "tab.png"
     command("review", *asked, "--screenshot", target)
     picture = cv2.imread(str(target))
     height_px = round(picture.shape[0] * _WIDTH_PX / picture.shape[1])

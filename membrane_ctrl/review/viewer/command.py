@@ -61,7 +61,7 @@ def review_command(options: ReviewOptions) -> int:
         return _show(file, options, cursor)
 
 
-def _show(file: Path, options: ReviewOptions, cursor: viewer.Moment | None) -> int:
+def _show(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | None) -> int:
     if options.screenshot is not None:
         return _picture(options.screenshot, file, cursor)
     if options.save is not None:
@@ -70,7 +70,7 @@ def _show(file: Path, options: ReviewOptions, cursor: viewer.Moment | None) -> i
     return viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor)
 
 
-def _picture(target: Path, source: Path | str, cursor: viewer.Moment | None = None) -> int:
+def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None = None) -> int:
     try:
         target.write_bytes(viewer.screenshot_of(source, cursor))
     except RuntimeError as error:
@@ -135,7 +135,7 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
             target.unlink()
 
 
-def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> viewer.Moment | None:
+def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> viewer.CursorTime | None:
     """Write the recording that the viewer opens.
 
     Raises InputError if the first run lacks a requested time or event, or no run has telemetry.
@@ -149,7 +149,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
 
     Returns
     -------
-    viewer.Moment or None
+    viewer.CursorTime or None
         Where to put the time cursor: the requested moment, or the start of the part.
     """
     runs = _with_telemetry(runs)
@@ -169,7 +169,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
     layer.close()
     if shown_ns is None:
         return None
-    return viewer.Moment(timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2)
+    return viewer.CursorTime(timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2)
 
 
 def labels_of(names: Sequence[str]) -> list[str]:

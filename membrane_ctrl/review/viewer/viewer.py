@@ -36,14 +36,14 @@ _STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class CursorTime:
     """A time on a timeline: nanoseconds since 1970 on `utc`, else since its 0."""
 
     timeline: str
     nanos: int
 
 
-def _put(client: ViewerClient, at: Moment) -> None:
+def _put(client: ViewerClient, at: CursorTime) -> None:
     if at.timeline == "utc":
         client.set_time(at.timeline, timestamp=np.datetime64(at.nanos, "ns"), play_state="paused")
     else:
@@ -55,7 +55,7 @@ def viewer_command(*arguments: str) -> list[str]:
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(source: Path | str, at: Moment | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
+def show(source: Path | str, at: CursorTime | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
     """Open a file or a server's page on this machine's screen; return when the window is closed.
 
     The cursor is put at a moment; `meanwhile` runs while the window is open and ends with it.
@@ -71,7 +71,7 @@ def show(source: Path | str, at: Moment | None = None, meanwhile: Meanwhile = la
     return _run(viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started)
 
 
-def put_cursor(process: subprocess.Popen[bytes], port: int, at: Moment, most_s: float = _CURSOR_S) -> None:
+def put_cursor(process: subprocess.Popen[bytes], port: int, at: CursorTime, most_s: float = _CURSOR_S) -> None:
     """Set a viewer's time cursor once its files are open, which a blueprint cannot do.
 
     A viewer that does not answer in time is left unchanged: its plots show the requested part anyway.
@@ -270,7 +270,7 @@ def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
         return _at_rest(viewer)
 
 
-def screenshot_of(source: Path | str, at: Moment | None = None) -> bytes:
+def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
     """PNG of a recording as it opens, at a moment or its end, or of a server's page.
 
     Raises RuntimeError as `screenshot`.
