@@ -83,7 +83,7 @@ def _overview(config: Config) -> rrb.Vertical:
             _plot("Flow and leak, mean of each second, µm/s", "/overview/loop/flow"),
         ),
         _lanes(),
-        row_shares=[3, 1.7, 1.7, 2.2],
+        row_shares=[3, 1.6, 1.6, 2.6],
     )
     page = rrb.TextDocumentView(name="Summary", origin=summary_panel.PATH)
     return rrb.Vertical(
@@ -107,10 +107,11 @@ def _loop(config: Config) -> rrb.Vertical:
 
 
 def _environment(config: Config) -> rrb.Vertical:
+    temperatures = ("/overview/ambient/temperature", "/overview/gas/temperature")
     return rrb.Vertical(
         _plot("Ambient pressure, mean of each second, Pa", "/overview/ambient/pressure"),
-        _plot(f"Gauge pressure, {_TICKS}, Pa", "/gas/pressure"),
-        _plot("Temperatures, °C", "/ambient/temperature", "/gas/temperature"),
+        _plot("Gauge pressure, mean of each second, Pa", "/overview/gas/pressure"),
+        _plot("Temperatures, mean of each second, °C", *temperatures),
         _error(config),
         name="Environment",
     )

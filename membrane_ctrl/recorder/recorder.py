@@ -179,11 +179,14 @@ class Recorder:
         """Take events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
-            self._status = self._status.after_event(run_events.from_dict(event), float(event.get("mono_s") or 0.0))
+            self._errors.guarded("status", partial(self._follow, event))
             self.urgent |= event.get("kind") in events.URGENT
             self.ended |= event.get("kind") == "end"
         self._events += new
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
+
+    def _follow(self, event: EventLine) -> None:
+        self._status = self._status.after_event(run_events.from_dict(event), float(event.get("mono_s") or 0.0))
 
     def _take_shape(self, message: bytes) -> None:
         estimate = shape_estimate.unpack_estimate(message)

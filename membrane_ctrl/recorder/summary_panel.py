@@ -37,7 +37,7 @@ def markdown(summary: Mapping[str, Any], status: RunStatus, config: Config) -> s
         "faults": str(summary["fault_count"] or "none"),
         "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
         "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
-        "paused": _span(held["paused_s"]) if held["paused_s"] else "",
+        "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
         "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
         "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected" if summary["cycles"] else "",
         "geometry": _geometry(summary["geometry"]),

@@ -180,9 +180,9 @@ BARS_PATH = "/shape/change_bars"
 MAPS = {
     "height": "height",
     "difference": "change",
-    "difference_no_tilt": "change less piston, tilt",
-    "difference_no_defocus": "change less piston, tilt, defocus",
-    "scatter": "standard deviation so far",
+    "difference_no_tilt": "less piston, tilt",
+    "difference_no_defocus": "less piston, tilt, defocus",
+    "scatter": "standard deviation",
     "uncertainty": "noise of a cycle, 1σ",
 }
 

@@ -131,7 +131,10 @@ OVERVIEW = Stream(
 )
 # A point per second all over the run: the others have every tick around events and one per second in quiet times, and
 # a line that changes its density looks as if the mirror had changed.
-_MEANS = {"/loop/position", "/truth/displacement", "/loop/flow", "/pump/drive", "/ambient/pressure"}
+_MEANS = frozenset({
+    "/loop/position", "/truth/displacement", "/loop/flow", "/pump/drive", "/gas/pressure", "/gas/temperature",
+    "/ambient/pressure", "/ambient/temperature",
+})  # fmt: skip
 MEANS = tuple(replace(stream, path=f"/overview{stream.path}") for stream in STREAMS if stream.path in _MEANS)
 TRUE_MEAN = replace(TRUE_ERROR, path="/overview/truth/error")
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)

@@ -25,7 +25,7 @@ from membrane_ctrl.recorder.sink import Recording, is_whole
 from membrane_ctrl.replay.repair import read_rows
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.events import EventsFile
-from tests.support.rrd_reading import has_footer, reader, scalars
+from tests.support.rrd_reading import has_footer, reader, scalars, strings
 from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 ROWS = rows_of(12.0)
@@ -125,6 +125,23 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
     assert summary["recorder"]["partial"] is False
     assert sorted(path.name for path in tmp_path.glob("*.rrd")) == ["test-000.rrd", "test-001.rrd"]
     assert not (tmp_path / ".recorder-state").exists()
+
+
+def test_the_page_of_the_next_recorder_knows_the_gains(tmp_path: Path, stack: ExitStack) -> None:
+    run = Run(tmp_path, stack, Config())
+    first = run.recorder(0)
+    gains = {"mono_s": 0.0, "kind": "command", "command": "gains", "who": "ann", "why": "", "loop": {
+        "kp_per_s": 0.8, "ti_s": 6.0, "td_s": 0.0}}  # fmt: skip
+    run.writers["events"].put(json.dumps(gains).encode())
+    run.second(first, 0)
+    second = run.recorder(1)
+    run.second(second, 1)
+    second.finish(in_haste=True)
+    pages = [
+        text for path in sorted(tmp_path.glob("*.rrd")) for _, text in strings(path, "/summary", "TextDocument:text")
+    ]
+    assert len(pages) >= 2
+    assert all("| gains | Kp 0.8 1/s, Ti 6 s, Td 0 s |" in page for page in pages)
 
 
 def test_what_is_handed_on_comes_back_to_the_last_bit(tmp_path: Path, stack: ExitStack) -> None:
