@@ -141,7 +141,9 @@ def _shape(config: Config) -> rrb.Vertical:
             _plot("Sag change by camera and laser, trim, µm", "/shape/sag_change", "/shape/trim",
                   span=(-band_um, band_um), marks=True),
             _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
-            rrb.BarChartView(name="Change of Z2..Z36, µm", origin=shapes.BARS_PATH),
+            rrb.BarChartView(
+                name="Change of Z2..Z36, µm", origin=shapes.BARS_PATH, plot_legend=rrb.PlotLegend(visible=False)
+            ),
         ),
         rrb.Horizontal(
             _plot("Slope residual, µrad", "/shape/residual"),

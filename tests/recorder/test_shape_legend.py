@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
-from membrane_ctrl.recorder.rerun_streams import _legend
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.recorder.rerun_streams import ShapeStreams, _legend
+from membrane_ctrl.recorder.sink import Recording
+from tests.support.rrd_reading import scalars, strings
 from tests.support.synthetic_run import shape_of
 
 
@@ -14,3 +22,27 @@ def test_both_error_bars_of_the_sag_are_told_apart() -> None:
     assert "± 0.100 µm from noise, ± 21.8 µm from geometry\n" in _legend(
         replace(shape, geometry_sag_sigma_um=21.84), shape, {}
     )
+
+
+def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path: Path) -> None:
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    shapes = ShapeStreams(recording)
+    for cycle, tilt_um in enumerate((0.0, 5.0)):
+        first = shape_of(0.0, 0)
+        coeffs_um = first.coeffs_um + tilt_um * (np.arange(36) == 1)
+        shapes.send(replace(first, time_s=700.0 * cycle, cycle=cycle, coeffs_um=coeffs_um))
+    recording.close()
+    path = tmp_path / "test-000.rrd"
+
+    def span(kind: str) -> list[float]:
+        return list(scalars(path, f"/shape/map/{kind}", "DepthImage:depth_range")[1][-1, 0])
+
+    low, high = span("difference")
+    assert 9.0 < high == -low < 10.0  # a tilt of 5 um RMS is 10 um at the rim
+    assert span("difference_no_tilt") == [-0.5, 0.5]  # nothing left: noise must not fill the colours
+    assert span("difference_no_defocus") == pytest.approx([-0.1, 0.1])
+    assert span("scatter") == pytest.approx([0.0, high / np.sqrt(2)], rel=1e-3)
+    assert span("height")[0] == span("uncertainty")[0] == 0.0
+    legend = strings(path, "/shape/legend", "TextDocument:text")[-1][1]
+    assert f"| change | ±{high:.3g} µm |" in legend

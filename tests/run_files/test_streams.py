@@ -86,6 +86,24 @@ def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> 
         time_s, values = scalars(tmp_path / "test-000.rrd", path)
         assert time_s == pytest.approx(np.arange(19) + 0.49), path
         assert values[:, 1] == pytest.approx(seconds[:, :, COLUMN[field]].mean(axis=1)), path
+    time_s, variances = scalars(tmp_path / "test-000.rrd", "/loop/band", "Measurements:variances")
+    assert time_s[0] == 0.0
+    assert 20.0 - 5.0 - block / 50 < time_s[-1] < 20.0
+    assert variances == pytest.approx(np.full((len(time_s), 1), Config().limits.band_um ** 2))
+
+
+def test_low_orders_have_the_variances_of_their_cycle(tmp_path: Path) -> None:
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    shapes = ShapeStreams(recording)
+    first, second = shape_of(0.0, 0), shape_of(2.0, 1)
+    for estimate in (first, second):
+        shapes.send(estimate)
+    recording.close()
+    _, values = scalars(tmp_path / "test-000.rrd", "/shape/change", "Measurements:values")
+    _, variances = scalars(tmp_path / "test-000.rrd", "/shape/change", "Measurements:variances")
+    assert values[1] == pytest.approx((second.coeffs_um - first.coeffs_um)[3:11])  # Z4 to Z11
+    assert variances[1] == pytest.approx(np.diag(second.covariance_um2)[3:11])
 
 
 def test_lines_are_vertical_and_of_their_kind() -> None:

@@ -83,10 +83,10 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
     numbers = "a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
     bowed.write_text(f"[optics.geometry]\n{numbers}[optics.geometry.screen]\nbow_mm = 1.0\n")
     flat.write_text(f"[geometry]\n{numbers}")
-    sets = [folder / f"set{place}" for place in range(4)]
+    sets = [folder / str(place) for place in range(5)]
     for place, capture in enumerate(sets):
-        command("simulate", capture, "--config", bowed, "--stated", flat, "--shrink", 4, "--displacement-um",
-                -2000 * place, "--seed", 1 + place)  # fmt: skip
+        command("simulate", capture, "--config", bowed, "--stated", flat, "--shrink", 2, "--displacement-um",
+                1500 * (place - 2), "--seed", 1 + place)  # fmt: skip
     out = folder / "geometry.toml"
     refused = subprocess.run([sys.executable, "-m", "membrane_ctrl", "calibrate", *sets, "--out", out], check=False)
     assert refused.returncode == 3

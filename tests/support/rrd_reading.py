@@ -9,14 +9,14 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 
-def scalars(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
+def scalars(path: Path, entity: str, component: str = "Scalars:scalars") -> tuple[np.ndarray, np.ndarray]:
     """Times in s of the run (n,) and values (n, m) of one entity, sorted by time."""
     times, values = [], []
     for chunk in reader(path).stream().filter(content=entity):
         batch = chunk.to_record_batch()
-        if "Scalars:scalars" in batch.schema.names and "run_time" in batch.schema.names:
+        if component in batch.schema.names and "run_time" in batch.schema.names:
             times += nanoseconds(batch)
-            values += batch.column("Scalars:scalars").to_pylist()
+            values += batch.column(component).to_pylist()
     order = np.argsort(np.array(times, dtype=np.int64), kind="stable")
     return np.array(times, dtype=np.int64)[order] * 1e-9, np.array(values)[order]
 
