@@ -33,8 +33,8 @@ def chosen(folder: SessionFolder, rig: HoldRig, yes: bool, name: str, progress: 
     """Show what each candidate gives and costs, and ask; false if a person wants none of them."""
     rows, now = session.offered(folder)
     model = session.found_of(folder).identified.model
-    shown = terminal.table_console(stderr=True, width=None if sys.stderr.isatty() else 170)
-    shown.print(trade.rich_table(rows, f"{now.name} is proposed", model.leak_um_per_s))
+    screen = terminal.table_console(stderr=True, width=None if sys.stderr.isatty() else 170)
+    screen.print(trade.shown(rows, f"proposed: {now.name}", model.leak_um_per_s))
     if name:
         session.choose(folder, name)
     while not (name or yes):

@@ -77,7 +77,7 @@ def measure_set(
     """
     begin = time.perf_counter()
     capture = read_set(folder, geometry)
-    where = folder / "capture.toml" if geometry is None else geometry.path
+    where = capture.head.folder / "capture.toml" if geometry is None else geometry.path
     require_plausible(capture.head.optics, where, depth_known=False)  # the set need not know its film's depth
     if capture.head.reference is not None:
         reference, own = read_anchor(capture.head.reference, geometry)

@@ -298,8 +298,9 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     said = capsys.readouterr().err
     assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in said] == ["fast", "present"]
     assert "ziegler-nichols: is not applied: Ms" in said
-    shown = [line.split()[1] for line in said.splitlines() if line.startswith("│ ") and line.split()[1] != "│"]
-    assert shown == ["present", "least-variance", *[name for name in NAMES if name in shown[2:]]]
+    shown = [line.split()[0] for line in said.splitlines() if line.strip()]
+    ordered = ["present", "least-variance", *[name for name in NAMES[1:] if name in shown]]
+    assert [name for name in shown if name in ordered] == 2 * ordered  # the figures, and what gets better and worse
     assert "in force" in said
     assert "simc-slow is on trial" in said
     assert "simc-slow is chosen" in done.file("report.html").read_text()
@@ -346,6 +347,18 @@ def test_gains_that_nobody_can_choose_are_refused_before_anything_moves(
     assert tune_twin(tmp_path, step, *words) == Exit.BAD_INPUT
     assert reason in capsys.readouterr().err
     assert not (tmp_path / "tuning").exists()
+
+
+def test_a_hold_is_watched_without_leaving_anything(
+    done: SessionFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(path.name for path in done.path.parent.iterdir())
+    assert tune_twin(tmp_path, "watch", "--session", str(done.path), *TIMES) == Exit.DONE
+    assert "of the lower bound" in capsys.readouterr().err
+    assert sorted(path.name for path in done.path.parent.iterdir()) == before
+    (tmp_path / "fresh").mkdir()
+    assert tune_twin(tmp_path / "fresh", "watch") == Exit.BAD_INPUT
+    assert sorted(path.name for path in (tmp_path / "fresh").iterdir()) == ["twin.toml"]
 
 
 def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:

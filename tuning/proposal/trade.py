@@ -3,6 +3,7 @@
 import math
 
 from pydantic import ValidationError
+from rich.console import Group
 from rich.table import Table
 
 from membrane_ctrl.config.schema import LoopConfig
@@ -31,19 +32,21 @@ def table(rows: tuple[design.Candidate, ...]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def rich_table(rows: tuple[design.Candidate, ...], title: str, leak_um_per_s: float) -> Table:
-    """The candidates for a terminal; `leak_um_per_s` is what the mirror loses now."""
+def shown(rows: tuple[design.Candidate, ...], title: str, leak_um_per_s: float) -> Group:
+    """The candidates for a terminal of 80 columns; `leak_um_per_s` is what the mirror loses now."""
+    figures = Table(title=title, box=None, padding=(0, 1, 0, 0))
+    words = Table("", "against the present gains", box=None, padding=(0, 1, 0, 0))
+    for number, head in enumerate(HEADS[:-1]):
+        figures.add_column("\n".join(head.rsplit(" ", 1)), justify="right" if number else "left", no_wrap=True)
+    for line in cells(rows):
+        figures.add_row(*(cell.replace(" +- ", "+-") for cell in line[:-1]))
+        words.add_row(line[0], line[-1])
     step = candidates.Demands().load_step_um_per_s
     caption = (
-        f"load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
+        f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
         "+-: 1 sigma of the fit; the weather of another hour changes every std alike."
     )
-    made = Table(title=title, caption=caption, caption_justify="left")
-    for number, head in enumerate(HEADS):
-        made.add_column(head, justify="right" if 0 < number < len(HEADS) - 1 else "left")
-    for line in cells(rows):
-        made.add_row(*line)
-    return made
+    return Group(figures, "", words, "", caption)
 
 
 def against(row: design.Candidate, present: design.Candidate | None) -> str:
