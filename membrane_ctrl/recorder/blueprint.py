@@ -159,7 +159,7 @@ def _shape(config: Config) -> rrb.Vertical:
 
 def _timing() -> rrb.Vertical:
     return rrb.Vertical(
-        _plot("Lateness of the tick, ms", "/tick/lateness"),
+        _plot(f"Lateness of the tick, {_TICKS}, ms", "/tick/lateness"),
         _plot("Time between ticks, s", "/tick/dt"),
         _plot("Ticks missed so far", "/tick/missed"),
         _plot("Last frame to result, ms", "/shape/latency"),
