@@ -12,37 +12,54 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _truth_is_no_number(cls, table: Any) -> Any:
-        """Refuse booleans: pydantic takes `true` for 1.0, so a leftover switch would pass as a quantity."""
-        if isinstance(table, dict):
-            for name, value in table.items():
-                field = cls.model_fields.get(name)
-                if field is not None and _has_truth(value) and not _takes_truth(field.annotation):
-                    raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
+    def _only_numbers_are_numbers(cls, table: Any) -> Any:
+        """Refuse `true` and "1" for a number: pydantic takes both, so a leftover switch would pass as a quantity."""
+        for name, value in table.items() if isinstance(table, dict) else ():
+            field = cls.model_fields.get(name)
+            if field is None or not _has(value, bool | str):
+                continue
+            kinds = _kinds(field.annotation)
+            if _has(value, bool) and not kinds & {bool, Any}:
+                raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
+            if _has(value, str) and kinds & {int, float} and not kinds & {str, Any}:
+                raise ValueError(
+                    f"{name}: {value!r} is a text; write a number, without quotes and with a decimal point"
+                )
         return table
 
 
-def _has_truth(value: Any) -> bool:
-    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_has_truth, value)))
+def _has(value: Any, kind: Any) -> bool:
+    return isinstance(value, kind) or (isinstance(value, list | tuple) and any(_has(part, kind) for part in value))
 
 
-def _takes_truth(annotation: Any) -> bool:
-    return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
+def _kinds(annotation: Any) -> set[Any]:
+    """Return the types in an annotation; of a literal, that of its values."""
+    inner = [_kinds(part) if not isinstance(part, int | str) else {type(part)} for part in get_args(annotation)]
+    return {annotation}.union(*inner) if inner or isinstance(annotation, type) or annotation is Any else set()
 
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Micrometres = Annotated[float, Field(ge=-1e7, le=1e7)]  # ten metres
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
-Serial = Annotated[str, Field(max_length=80)]
-UnitId = Annotated[int, Field(ge=1, le=247)]
-Timeout = Annotated[float, Field(gt=0, le=5)]
-Baud = Annotated[int, Field(ge=300, le=1_000_000)]
 Distance = Annotated[float, Field(ge=-1e4, le=1e4)]
-Direction = Literal[-1, 1]
-StepMax = Annotated[float, Field(gt=0, le=10_000)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
-Port = Annotated[str, Field(min_length=1)]  # /dev/ttyUSB0, or usb:VID:PID[:SERIAL]
-ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://")]  # tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200
+# what means the same for every device says so here
+_PORT = "Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."
+Port = Annotated[str, Field(min_length=1, description=_PORT)]
+_LINK = "Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."
+ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://.", description=_LINK)]
+_UNIT = "Modbus address of the device. Set it as stored in the device."
+UnitId = Annotated[int, Field(ge=1, le=247, description=_UNIT)]
+_SERIAL = "Serial number; empty: whichever answers. Set it to refuse any other instrument."
+Serial = Annotated[str, Field(max_length=80, description=_SERIAL)]
+_TIMEOUT = "Longest wait for an answer. Raise it on a slow line or machine."
+Timeout = Annotated[float, Field(gt=0, le=5, description=_TIMEOUT)]
+_BAUD = "Baud rate as stored in the device. Change it if the device was set to another."
+Baud = Annotated[int, Field(ge=300, le=1_000_000, description=_BAUD)]
+_DIRECTION = "Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."
+Direction = Annotated[Literal[-1, 1], Field(description=_DIRECTION)]
+_STEP = "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
+StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
 class Optoncdt1420Config(Section):
@@ -50,9 +67,7 @@ class Optoncdt1420Config(Section):
 
     driver: Literal["optoncdt1420"] = "optoncdt1420"
     port: Port
-    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 921_600
-    """Baud rate as stored in the sensor. Change it if the sensor was set to another."""
     rate_khz: Annotated[float, Field(ge=0.25, le=4)] = 4.0
     """Measuring rate: 0.25, 0.5, 1, 2 or 4. Lower it with `baud`, or for a dark target."""
     range_mm: Annotated[float, Field(gt=0, le=500)] | None = None
@@ -60,9 +75,7 @@ class Optoncdt1420Config(Section):
     zero_mm: Distance | None = None
     """Distance from the start of the range at displacement 0; its middle when absent. Set it to move the zero."""
     direction: Direction = -1
-    """Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."""
     step_max_um: StepMax = 50.0
-    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
     timeout_s: Timeout = 0.2
     """Longest wait for an answer, and for a new value after a reading. Raise it on a slow machine."""
 
@@ -81,10 +94,8 @@ class KeyenceDlRs1aConfig(Section):
 
     driver: Literal["keyence_dl_rs1a"] = "keyence_dl_rs1a"
     port: Port
-    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Literal[2400, 4800, 9600, 19_200, 38_400] = 9600
-    """Baud rate as set by the unit's switches; 9600 gives 25 readings per second, 38400 gives 80.
-    Set it to 38400, with the switches."""
+    """Baud rate as set by its switches; 9600 gives 25 readings per second, 38400 gives 80. Set it to 38400."""
     parity: Literal["N", "E", "O"] = "N"
     """Parity as set by the switches. Set it to E, with the switches: without it a corrupted digit passes."""
     amplifier: Annotated[int, Field(ge=0, le=14)] = 0
@@ -92,11 +103,8 @@ class KeyenceDlRs1aConfig(Section):
     zero_mm: Distance = 0.0
     """Value at displacement 0. Change it to move the zero."""
     direction: Direction = -1
-    """Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."""
     step_max_um: StepMax = 10.0
-    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
     timeout_s: Timeout = 0.1
-    """Longest wait for an answer. Raise it at low baud rates."""
 
 
 class VaisalaPtb330Config(Section):
@@ -104,15 +112,12 @@ class VaisalaPtb330Config(Section):
 
     driver: Literal["vaisala_ptb330"] = "vaisala_ptb330"
     port: Port
-    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 4800
-    """Baud rate as stored in the instrument. Change it if the instrument was set to another."""
     period_s: Annotated[float, Field(gt=0, le=60)] = 0.2
     """Interval between requests; a message takes 80 ms at 4800 baud. Raise it at lower baud rates."""
     age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0
     """Age from which a value is no longer used. Raise it for a slow measurement."""
     timeout_s: Timeout = 0.3
-    """Longest wait for an answer. Raise it at low baud rates."""
 
 
 class VentusConfig(Section):
@@ -120,11 +125,9 @@ class VentusConfig(Section):
 
     driver: Literal["ventus"] = "ventus"
     port: Port
-    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     power_max_mw: Annotated[float, Field(gt=0, le=1400)] = 1000.0
     """Power at full drive; none of these pumps takes more than 1400. Change it to your pump's rating."""
     timeout_s: Timeout = 0.1
-    """Longest wait for an answer. Raise it on a slow machine."""
 
 
 class BronkhorstModbusConfig(Section):
@@ -132,13 +135,9 @@ class BronkhorstModbusConfig(Section):
 
     driver: Literal["bronkhorst_modbus"]
     link: ModbusUrl
-    """Its Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."""
     unit_id: UnitId
-    """Modbus address of the instrument. Set it as stored in the instrument."""
     serial: Serial = ""
-    """Serial number; empty: whichever answers. Set it to refuse any other instrument."""
     timeout_s: Timeout = 0.2
-    """Longest wait for an answer. Raise it on a slow line."""
 
 
 class BronkhorstProparConfig(Section):
@@ -146,15 +145,11 @@ class BronkhorstProparConfig(Section):
 
     driver: Literal["bronkhorst_propar"] = "bronkhorst_propar"
     port: Port
-    """Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."""
     baud: Baud = 38_400
-    """Baud rate as stored in the instrument. Change it if the instrument was set to another."""
     node: Annotated[int, Field(ge=1, le=128)] = 128
     """ProPar node; 128: whatever is at the end of the cable. Change it to insist on one node."""
     serial: Serial = ""
-    """Serial number; empty: whichever answers. Set it to refuse any other instrument."""
     timeout_s: Timeout = 0.2
-    """Longest wait for an answer. Raise it on a slow machine."""
 
 
 class ModbusMapConfig(Section):
@@ -165,11 +160,8 @@ class ModbusMapConfig(Section):
 
     driver: Literal["modbus_map"]
     link: ModbusUrl
-    """Its Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."""
     unit_id: UnitId = 1
-    """Modbus address of the device. Change it if the device has another."""
     timeout_s: Timeout = 0.2
-    """Longest wait for an answer. Raise it on a slow line."""
     preset: str = ""
     """File of firmware_iface/presets with defaults for the keys below. Set it if your device has one."""
     function: Literal["holding", "input"] | None = None

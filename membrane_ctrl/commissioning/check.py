@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from firmware_iface import role_bench, roles
@@ -106,17 +105,17 @@ def _show(source: str, probes: list[DeviceProbe], would: dict[str, str], warning
         for probe in probes:
             latency = f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
             words = (probe.role, probe.device, probe.identity or "not usable", probe.reading, latency)
-            table.add_row(*(escape(word) for word in words))
+            table.add_row(*words)
         console.print(table)
     for probe in probes:
         for word, line in (("wrong", probe.problem), ("note", probe.notes)):
             if line:
-                console.print(escape(f"{probe.role}: {word}: {line}"), soft_wrap=True)
+                console.print(f"{probe.role}: {word}: {line}", soft_wrap=True)
     for warning in warnings:
-        console.print(escape(warning), soft_wrap=True)
-    table = Table(title=f"{source}", title_justify="left", show_header=False)
+        console.print(warning, soft_wrap=True)
+    table = Table(title=source, title_justify="left", show_header=False)
     for name, line in would.items():
-        table.add_row(name, escape(line))
+        table.add_row(name, line)
     console.print(table)
 
 
@@ -141,9 +140,11 @@ def _what_would_happen(config: Config) -> dict[str, str]:
 
 
 def _port(port: PortConfig) -> str:
-    """Where the control port would listen. Raises InputError for unusable certificates."""
+    """Where the control port would listen. Raises InputError for unusable certificates or group."""
     if not port.enabled:
         return "off"
+    if port.group is not None:
+        sockets.group_id(port.group)
     ways = [port.socket or f"{SOCKET_NAME} beside the run folders"]
     if port.tls is not None:
         sockets.server_context(port.tls)

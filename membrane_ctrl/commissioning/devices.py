@@ -5,7 +5,6 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rich.markup import escape
 from rich.table import Table
 
 from firmware_iface import conformance, roles
@@ -36,11 +35,11 @@ def list_devices(as_json: bool) -> int:
         return errors.Exit.DONE
     table = Table("kind", "name", "to paste")
     for device in found:
-        table.add_row(device.kind, escape(device.name), escape(device.paste))
+        table.add_row(device.kind, device.name, device.paste)
     console = terminal.table_console()
     console.print(table if found else "nothing found: no serial port, camera or display")
     for note in missing:
-        console.print(escape(note))
+        console.print(note)
     return errors.Exit.DONE
 
 
@@ -98,7 +97,7 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     else:
         table = Table("check", "result", "docs/firmware.md")
         for finding in findings:
-            table.add_row(finding.check, escape(finding.problem) or "passed", finding.section)
+            table.add_row(finding.check, finding.problem or "passed", finding.section)
         terminal.table_console().print(table)
         terminal.table_console().print("conforms" if passed else "does not conform: do not use it to run a pump")
     return errors.Exit.DONE if passed else errors.Exit.REJECTED

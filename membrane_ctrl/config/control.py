@@ -30,8 +30,7 @@ class LoopConfig(Section):
     flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 20.0
     """Fastest change of the flow. Lower it for a drive that must not be stepped."""
     setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
-    """Speed at which the setpoint moves, upwards; downwards no faster than the leak.
-    Lower it if the mirror lags behind its ramp, for instance with a weaker pump."""
+    """Speed of the setpoint, upwards; downwards no faster than the leak. Lower it for a weaker pump."""
     feedforward_barometer: bool = True
     """Correct for the barometer's changes. Set it to false on a bench without a barometer."""
     feedforward_temperature: bool = True
@@ -71,17 +70,15 @@ class LimitsConfig(Section):
     """Limits the mirror must never exceed."""
 
     displacement_min_um: Micrometres = -2000.0
-    """Shallowest bowl while held; shallower is the fault `under_displacement`.
-    Change it to the laser's range and the optics' use."""
+    """Shallowest bowl while held (`under_displacement`). Change it to the laser's range and the optics' use."""
     displacement_max_um: Micrometres = 500.0
-    """Deepest bowl; deeper is the fault `over_displacement`. Change it to what the film and the laser can take."""
+    """Deepest bowl (`over_displacement`). Change it to what the film and the laser can take."""
     gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
     """Highest gauge pressure; above it the mirror is vented. Change it for another film, below what tears it."""
     stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
     """Time without a reading that counts as a loss. Raise it only for devices that answer that rarely."""
     stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
-    """Identical laser readings for this long mean a dead sensor, because a film is never still.
-    Raise it for a laser with coarse steps on a calm mirror."""
+    """Identical readings for this long mean a dead laser: no film is still. Raise it for a laser of coarse steps."""
     lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
     """Lateness of a tick that counts as missed control. Leave it, and move other work off a late machine."""
     step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0

@@ -15,12 +15,10 @@ NEEDED = ("displacement", "pump", "gauge_pressure")
 class DevicesConfig(settings.Section):
     """Which device fills which role: a board fills all, or one table per role."""
 
-    board: str | None = None
+    board: settings.ModbusUrl | None = None
     """The pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200. Set it, or one table per role."""
     unit_id: settings.UnitId = 1
-    """The board's Modbus unit identifier. Change it if the board has another."""
     timeout_s: settings.Timeout = 0.2
-    """Longest wait for an answer of the board. Raise it on a slow line."""
     watchdog_s: Annotated[float, Field(ge=0.1, le=10)] = 0.5
     """Time without commands after which the board stops the pump. Raise it for tick rates below 4 Hz."""
     displacement: settings.DisplacementDriver | None = None

@@ -134,8 +134,7 @@ class GeometryConfig(Section):
     alpha_sigma_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     """Standard uncertainty of `alpha_deg`. Set it to get the error bars of the height."""
     reference_displacement_um: Micrometres | None = None
-    """Displacement at which the geometry was measured; the first frame's when absent.
-    Set it if the mirror stood elsewhere then."""
+    """Displacement when measured; the first frame's when absent. Set it if the mirror stood elsewhere then."""
     camera: CameraPoseConfig | None = None
     screen: ScreenPoseConfig | None = None
 

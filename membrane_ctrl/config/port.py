@@ -92,8 +92,7 @@ class AlarmsConfig(Section):
     """Which alarms go to whom. Without `urls_file` none are sent."""
 
     urls_file: str | None = None
-    """File with one Apprise URL per line, kept apart because every run copies the configuration.
-    Set it to send alarms; without it none are sent."""
+    """File with one Apprise URL per line, which no run copies. Set it to send alarms; without it none are sent."""
     escalation_urls_file: str | None = None
     """The same for those who are notified when nobody acknowledges. Set it if there is a second person to tell."""
     escalate_after_s: Annotated[float, Field(ge=1, le=1e6)] = 900.0

@@ -67,8 +67,7 @@ class RecordingConfig(Section):
     segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0
     """Length of a file of the recording; a crash leaves at most this much unoptimised. Lower it for smaller files."""
     quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 1.0
-    """Rows per second for the viewer while nothing happens; the tables have every tick.
-    Raise it to see more, at the cost of space."""
+    """Rows per second for the viewer while nothing happens. Raise it to see more, at the cost of space."""
     keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
     """Delete the oldest runs beyond this total; absent: never. Set it on a machine that nobody clears."""
     keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None

@@ -3,6 +3,7 @@
 import difflib
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -37,7 +38,7 @@ def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
 def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not TOML)."""
     try:
-        text = read_text(path, _BYTES_MAX, follow=follow)
+        text = read_text(path, _BYTES_MAX, follow=follow).removeprefix("\ufeff")  # as some editors begin a file
         if any(map(_too_many_parts, text.splitlines())):
             raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
         return tomllib.loads(text)
@@ -51,8 +52,19 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({os_reason(error)})") from None
     except RecursionError:
         raise InputError(f"{path}: not valid TOML: nested too deep") from None
-    except ValueError as error:  # of TOML, of UTF-8, of a number with thousands of digits
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not valid TOML: not UTF-8 text (UTF-16, perhaps); save it as UTF-8") from None
+    except ValueError as error:  # of TOML, of a number with thousands of digits
+        raise InputError(f"{path}: not valid TOML: {_cause(str(error), text)}") from None
+
+
+def _cause(message: str, text: str) -> str:
+    """Return the parser's message, with the usual cause for two that do not tell it."""
+    found = re.search(r"at line (\d+)", message)
+    line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
+    if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):
+        return f"{message}: a number has a decimal point; write {number[1]}.{number[2]}"
+    return f"{message}: {line} comes twice" if "overwrite" in message or "twice" in message else message
 
 
 def _too_many_parts(line: str) -> bool:
@@ -121,16 +133,26 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for a validation error: the field, the problem and the remedy."""
     path, parent = _walk(model, error["loc"])
     field = ".".join(str(part) for part in path)
-    if error["type"] == "extra_forbidden":
-        return (
-            f"{field}: unknown key; {hint(str(error['loc'][-1]), [] if parent is None else [*parent.model_fields])}"
-        )
-    if error["type"] == "union_tag_invalid":
-        tag, known = str(error["ctx"]["tag"]), re.findall(r"'([^']*)'", error["ctx"]["expected_tags"])
-        return f"{field}.driver: {tag!r} is not known here; {hint(tag, known)}"
-    message = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return f"{field}: {message}" if field else message
+    kind, fields = error["type"], {} if parent is None else parent.model_fields
+    if kind == "extra_forbidden":
+        key = str(error["loc"][-1])
+        home = next(_homes(model, key), "")
+        return f"{field}: unknown key; {hint(key, [*fields], home and f'it belongs in [{home}]')}"
+    inner = sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
+    if kind.startswith("union_tag"):
+        tag, known = str(error["ctx"].get("tag", "")), [str(tag) for section in inner for tag in tags(section)]
+        return f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; {hint(tag, known)}"
+    message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
+    if kind == "value_error":  # some begin with the key
+        return f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}" if field else message
+    if kind == "missing":
+        return f"{field}: missing; it has no default"
+    if kind.startswith("model_"):
+        return f"{field}: write a table, [{field}] and its keys below"
+    if kind == "tuple_type":
+        return f"{field}: write a list, " + (f"[[{field}]] and its keys below" if inner else "in square brackets")
+    if kind == "string_pattern_mismatch" and "tcp|rtu" in message:
+        return f"{field}: {error['input']!r}: expected tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200"
     value = error["input"]
     shown = f" (it is {value!r})" if isinstance(value, (int, float, str, bool)) else ""
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
@@ -142,6 +164,15 @@ def hint(word: str, known: list[str], otherwise: str = "") -> str:
     if near:
         return f"did you mean {near[0]}?"
     return otherwise or (f"known: {', '.join(known)}" if known else "remove it")
+
+
+def _homes(model: type[BaseModel], key: str, prefix: str = "") -> Iterator[str]:
+    """Yield the tables that have a key."""
+    for name, field in model.model_fields.items():
+        for section in sections(field.annotation):
+            if key in section.model_fields:
+                yield f"{prefix}{name}"
+            yield from _homes(section, key, f"{prefix}{name}.")
 
 
 def _telling(errors: list[ErrorDetails]) -> ErrorDetails:

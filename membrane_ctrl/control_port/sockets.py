@@ -46,8 +46,10 @@ class UnixListener:
             _remove_stale(path)
             self.socket = _bound(path, group)
         except OSError as error:
-            reason = os_reason(error)
-            raise DeviceError(f"{path}: no control port there ({reason}); choose another with port.socket") from None
+            raise DeviceError(
+                f"{path.parent}: cannot be written, and there is no control port in it ({os_reason(error)}); choose "
+                "another folder for the runs with --logs or recording.logs_dir, or for the socket with port.socket"
+            ) from None
         self._inode = path.stat().st_ino
 
     def peer(self, connection: socket.socket) -> session.Peer:
@@ -89,19 +91,25 @@ def _remove_stale(path: Path) -> None:
     raise DeviceError(f"{path}: another hold is listening there; stop it, or choose another path with port.socket")
 
 
+def group_id(name: str) -> int:
+    """The number of a group. Raises InputError."""
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        raise InputError(
+            f"port.group: no group {name!r} on this machine; create it (sudo groupadd {name}), or omit the key"
+        ) from None
+
+
 def _bound(path: Path, group: str | None) -> socket.socket:
+    owner = -1 if group is None else group_id(group)
     listener = socket.socket(socket.AF_UNIX)
     umask = os.umask(0o777 & ~_MODE)  # the file must never have wider permissions
     try:
         with short(path) as address:
             listener.bind(address)
-        if group is not None:
-            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        os.chown(path, -1, owner)
         listener.listen(endpoint.BACKLOG)
-    except KeyError:
-        listener.close()
-        path.unlink()
-        raise InputError(f"port.group: no group {group!r} on this machine") from None
     except OSError:
         listener.close()
         raise

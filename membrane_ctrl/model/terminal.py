@@ -51,7 +51,7 @@ def table_console(stderr: bool = False, width: int | None = None) -> Console:
     """A Rich console for tables that passes Rich's own colours, but no control characters in the cells."""
     from rich.console import Console
 
-    made = Console(stderr=stderr, width=width)
+    made = Console(stderr=stderr, width=width, markup=False, emoji=False)  # texts have [square brackets]
     made.push_render_hook(_Cells())  # type: ignore[arg-type]  # its base class is Rich's, loaded here only
     return made
 

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from membrane_ctrl.model import errors, events, plain_json, terminal
@@ -127,7 +126,7 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
         table.add_column(title, justify="left" if title in words else "right")
     for entry in found:
         table.add_row(
-            escape(one_line(entry.name)),
+            one_line(entry.name),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             span(entry.duration_s),
             span(entry.held_s),
@@ -136,9 +135,9 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
             str(entry.faults),
             number(entry.kp_per_s),
             number(entry.ti_s),
-            escape(entry.configuration),
+            entry.configuration,
             f"{entry.size_mb:.1f}",
-            escape(one_line(entry.exit))
+            one_line(entry.exit)
             + (f", {entry.marks} marked" if entry.marks else "")
             + (", kept" if entry.kept else ""),
         )

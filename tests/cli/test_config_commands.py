@@ -104,7 +104,7 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     told = capsys.readouterr().err
     assert "did you mean optoncdt1420?" in told
     assert "pump: link" in told
-    assert "# Modbus address of the instrument." in path.read_text()
+    assert "# Modbus address of the device." in path.read_text()
 
 
 def test_answers_that_contradict_each_other_write_nothing(

@@ -81,7 +81,7 @@ def test_a_screens_height_map_may_be_a_file(tmp_path: Path) -> None:
         ("file = 'lab.toml'\n", ["height_map.file", "could not convert"]),
         ("file = 'a'\nheights_mm = [[0, 0]]\n", ["give either the file or heights_mm"]),
         ("heights_mm = [[0, 0]]\n", ["screen.height_map", "1 rows of 2"]),
-        ("", ["heights_mm", "required"]),
+        ("", ["heights_mm", "missing"]),
     ],
 )
 def test_a_wrong_height_map_is_one_line(tmp_path: Path, tail: str, words: list[str]) -> None:
@@ -101,3 +101,55 @@ def test_every_default_is_written_out() -> None:
     tables = tomllib.loads(dump(Config()))
     assert tables["loop"]["ti_s"] == Config().loop.ti_s
     assert set(tables) == set(Config.model_fields) - {"devices"}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"[loop]\nkp_per_s = 0,61\n", ["line 2", "write 0.61"]),
+        (b"[loop]\nkp_per_s = '0,61'\n", ["loop.kp_per_s", "'0,61'", "without quotes, with a decimal point"]),
+        (b"[loop]\nkp_per_s = '0.61'\n", ["loop.kp_per_s", "without quotes"]),
+        (b"[optics.camera]\nprincipal_px = ['1', 2]\n", ["optics.camera.principal_px", "without quotes"]),
+        (b"[loop]\nkp_per_s = true\n", ["loop.kp_per_s", "true is neither"]),
+        (b"[twin]\nseed = true\n", ["twin.seed", "true is neither"]),
+        (b"[loop]\nkp_per_s = 1\nkp_per_s = 2\n", ["line 3", "kp_per_s = 2 comes twice"]),
+        (b"[loop]\n[loop]\n", ["line 2", "[loop] comes twice"]),
+        (b"loop = 3\n", ["loop: write a table, [loop]"]),
+        (b"[[loop]]\nkp_per_s = 1\n", ["loop: write a table, [loop]"]),
+        (b"[alarms.rules]\nname = 'x'\n", ["[[alarms.rules]]"]),
+        (b"[resume]\nfaults = 'link_lost'\n", ["resume.faults: write a list, in square brackets"]),
+        (b"kp_per_s = 1\n", ["it belongs in [loop]"]),
+        (b"[optics]\na_mm = 2672\n", ["it belongs in [optics.geometry]"]),
+        (b"[devices.pump]\nport = '/dev/x'\n", ["devices.pump.driver: missing", "ventus"]),
+        (b"[devices.displacement]\ndriver = 'optoncdt1420'\n", ["devices.displacement.port: missing"]),
+        (b"[devices]\nboard = '10.0.0.3:502'\n", ["devices.board", "tcp://HOST:PORT"]),
+        (b"[devices]\nboard = 'tcp://'\n", ["devices.board", "tcp://HOST:PORT"]),
+        (b"[optics]\ngeometry_file = 3\n", ["optics.geometry_file", "valid path (it is 3)"]),
+        (b"[limits]\ndisplacement_min_um = -1e308\n", ["limits.displacement_min_um", "-10000000"]),
+        (b"[twin]\nseed = 99999999999999999999\n", ["twin.seed"]),
+        (b"[loop]\nkp_per_s = 1e400\n", ["loop.kp_per_s", "finite"]),
+        ("[loop]\nkp_per_s = 1\n".encode("utf-16"), ["UTF-8"]),
+    ],
+    ids=repr,
+)
+def test_the_line_says_what_to_write_instead(tmp_path: Path, text: bytes, words: list[str]) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_bytes(text)
+    with pytest.raises(InputError) as caught:
+        load(path, Config)
+    line = str(caught.value)
+    assert "\n" not in line
+    for word in [str(path), *words]:
+        assert word in line, line
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"", b"\xef\xbb\xbf[loop]\nkp_per_s = 0.5\n", b"[loop]\r\n\tkp_per_s = 0.5\r\n", b"# only a comment"],
+    ids=["empty", "byte order mark", "other line ends and tabs", "comment"],
+)
+def test_what_editors_write_is_read(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "lab.toml").write_bytes(text)
+    (tmp_path / "link.toml").symlink_to("lab.toml")
+    config = load(tmp_path / "link.toml", Config)
+    assert config.loop.kp_per_s == (0.5 if b"kp" in text else Config().loop.kp_per_s)
