@@ -22,9 +22,7 @@ class Section(BaseModel):
             if _has(value, bool) and not kinds & {bool, Any}:
                 raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
             if _has(value, str) and kinds & {int, float} and not kinds & {str, Any}:
-                raise ValueError(
-                    f"{name}: {value!r} is a text; write a number, without quotes and with a decimal point"
-                )
+                raise ValueError(f"{name}: {value!r}: write a number, without quotes, with a decimal point")
         return table
 
 

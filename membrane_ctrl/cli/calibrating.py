@@ -13,8 +13,9 @@ BoardOption = Annotated[
 ]
 
 
-def add_auxiliary_commands(app: typer.Typer) -> None:
-    """Add `calibrate-board`, `calibrate-camera`, `calibrate-pose`, `calibrate-display`."""
+def add_commands(app: typer.Typer) -> None:
+    """Add `calibrate`, `calibrate-board`, `calibrate-camera`, `calibrate-pose`, `calibrate-display`."""
+    app.command()(calibrate)
     app.command("calibrate-board")(calibrate_board)
     app.command("calibrate-camera")(calibrate_camera)
     app.command("calibrate-pose")(calibrate_pose)
@@ -71,12 +72,6 @@ def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
     from membrane_ctrl.calibration.display import calibrate_display as run
 
     return run(configured(config), str(config), json)
-
-
-def add_commands(app: typer.Typer) -> None:
-    """Add `calibrate`."""
-    app.command()(calibrate)
-    add_auxiliary_commands(app)
 
 
 def calibrate(

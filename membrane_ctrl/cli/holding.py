@@ -12,7 +12,7 @@ from membrane_ctrl.model import clock, errors, terminal
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
 
-alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
 
 FlatOption = Annotated[
     bool, typer.Option("--from-flat", help="Start with a flat simulated mirror; filling it takes two hours.")
@@ -119,11 +119,6 @@ def conformance(
     from membrane_ctrl.commissioning.devices import run_conformance
 
     return run_conformance(url, unit_id, json)
-
-
-@alarm_app.callback()
-def alarm() -> None:
-    """Test the alarm messages."""
 
 
 @alarm_app.command("test")
