@@ -147,7 +147,7 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}" if field else message
     if kind == "missing":
         return f"{field}: missing; it has no default"
-    if kind.startswith("model_"):
+    if "valid dictionary" in message:
         return f"{field}: write a table, [{field}] and its keys below"
     if kind == "tuple_type":
         return f"{field}: write a list, " + (f"[[{field}]] and its keys below" if inner else "in square brackets")
