@@ -395,6 +395,17 @@ def test_a_rig_on_a_hold_records_without_a_gap() -> None:
     np.testing.assert_array_equal(together.displacement_um, read)
 
 
+def test_ticks_from_before_the_answer_are_not_recorded() -> None:
+    link = TwinHold(Config(twin=TwinConfig(start_error_um=-3.0), shape=ShapeConfig(enabled=False)))
+    rig = HoldRig(link, "tester")
+    rig.hold(0.1)  # the rest of half a second waits
+    rig.catch_up()
+    ticks = len(link.rows)
+    after = rig.hold(0.3)
+    read = [row.displacement_um for row in link.rows[ticks : ticks + len(after)]]
+    np.testing.assert_array_equal(after.displacement_um, read)
+
+
 @pytest.mark.parametrize("name", ["experiments.png", "session.rrd"])
 def test_what_cannot_be_written_ends_in_one_line(
     done: SessionFolder, capsys: pytest.CaptureFixture[str], name: str
