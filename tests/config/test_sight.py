@@ -74,7 +74,7 @@ def general(
         ),
         (general(screen=turned(1, 180.0)), "screen.origin_mm", "of the mirror"),
         (general(flip=-1.0), "screen.origin_mm", "meets the screen never"),
-        (general(everything=turned(0, 180.0)), "screen.origin_mm", "0% of the mirror"),  # behind the film
+        (general(everything=turned(0, 180.0)), "screen.origin_mm", "is seen in 0% of the mirror"),  # behind the film
     ],
 )
 def test_a_bench_that_cannot_measure_names_the_reason_and_the_key(optics: OpticsConfig, key: str, words: str) -> None:
