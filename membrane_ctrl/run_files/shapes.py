@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model import shape_estimate
-from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.arrays import AnyArray, Column
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,9 +207,8 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
 
 def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> Map:
     """Height minus that of the reference, each above its own vertex; um, as `height_map_mm`."""
-    now, before = _surface(estimate), _surface(reference)
-    change = Surface(now.coeffs_mm - before.coeffs_mm, now.hencky_mm - before.hencky_mm, 1.0)
-    return _spread(change.height(*_points()) * 1e3)
+    change_um = estimate.coeffs_um - reference.coeffs_um
+    return change_map_um(np.append(change_um, estimate.hencky_um - reference.hencky_um))
 
 
 def change_map_um(parameters_um: Column) -> Map:
@@ -223,10 +222,16 @@ def deviation_map_um(parameters_um: Column) -> Map:
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def without_terms(height: Map, terms: int) -> Map:
-    """A map less its best fit of the first Zernike terms: 3 removes piston and tilt, 4 defocus as well."""
-    values, basis = height[_inside()].astype(np.float64), _terms()[:terms]
-    return _spread(values - np.linalg.lstsq(basis.T, values, rcond=None)[0] @ basis)
+def without_terms(height: AnyArray, terms: int) -> AnyArray:
+    """A square map of the unit disc less the best fit of the first Zernike terms to its finite pixels.
+
+    3 terms are piston and tilt, 4 defocus as well.
+    """
+    there = np.isfinite(height)
+    x, y = _grid(len(height))
+    basis, left = zernike.values(x[there], y[there])[:terms], height.copy()
+    left[there] -= np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0] @ basis
+    return left
 
 
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
@@ -295,8 +300,8 @@ def _terms() -> NDArray[np.float64]:
     return zernike.values(*_points())
 
 
-def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _grid(px: int = MAP_PX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixel centres on the unit disc's square."""
-    axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
+    axis = (np.arange(px) + 0.5) * 2 / px - 1
     x, y = np.meshgrid(axis, -axis)
     return x, y

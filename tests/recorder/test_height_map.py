@@ -94,3 +94,11 @@ def test_one_cycle_does_not_scatter() -> None:
     scatter = Scatter()
     scatter.add(flat() + 1e4)
     assert np.nanmax(scatter.map_um()) == 0.0
+
+
+def test_terms_are_removed_from_a_map_of_another_size_and_area() -> None:
+    x, y = np.meshgrid(*2 * [(np.arange(128) + 0.5) / 64 - 1])
+    tilted_um = np.where(np.hypot(x, y) < 0.8, 2 + x + 3 * y + x**2 + y**2, np.nan)
+    left_um = without_terms(tilted_um, 4)
+    assert (np.isnan(left_um) == np.isnan(tilted_um)).all()
+    assert np.nanmax(np.abs(left_um)) < 1e-9

@@ -18,6 +18,7 @@ from membrane_ctrl.review.report.json import timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.words import one_line, span
+from membrane_ctrl.run_files.shapes import without_terms
 
 BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"
 WIDTH_IN = 10.5
@@ -267,12 +268,16 @@ def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
 
 
 def pairs(shape: shape_review.ShapeReview) -> str:
-    """Height change of cycles 1 and 10 minutes apart, and its uncertainty."""
-    with picture(len(shape.pairs), 2, 3.4 * len(shape.pairs), squeeze=False) as (figure, plots):
-        for (change, sigma), pair in zip(plots, shape.pairs, strict=True):
-            most = float(np.nanmax(np.abs(pair.change_um))) or 1e-3
+    """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its uncertainty."""
+    with picture(len(shape.pairs), 3, 2.8 * len(shape.pairs), squeeze=False) as (figure, plots):
+        for (change, less, sigma), pair in zip(plots, shape.pairs, strict=True):
             title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
-            _map(figure, change, pair.change_um, title, "RdBu_r", (-most, most))
+            for plot, values, said in (
+                (change, pair.change_um, title),
+                (less, without_terms(pair.change_um, 4), "Less piston, tilt, defocus, µm"),
+            ):
+                most = float(np.nanquantile(np.abs(values), 0.99)) or 1e-3  # a few pixels must not hide the rest
+                _map(figure, plot, values, said, "RdBu_r", (-most, most))
             if pair.sigma_um is None:
                 sigma.text(0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes)
                 sigma.set_axis_off()

@@ -100,6 +100,7 @@ class RunCatalogue:
 def _row(entry: catalogue.RunEntry, file: Path) -> Path:
     """Write a recording that has only the run's properties; unknown ones are omitted."""
     values = catalogue.as_dict(entry) | {"started_utc": f"{entry.started_utc:%Y-%m-%d %H:%M:%S}"}
+    values["geometry"] = entry.geometry[:8]
     values["faults_share"] = entry.faults_s / entry.duration_s if entry.duration_s else float("nan")
     # more digits would make the table's columns too wide to compare
     values |= {name: float(f"{value:.4g}") for name, value in values.items() if isinstance(value, float)}

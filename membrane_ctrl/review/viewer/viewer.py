@@ -1,6 +1,5 @@
 """Starts the viewer on a review: on this screen, for a browser, to a picture, or following a run in progress."""
 
-import argparse
 import os
 import socket
 import subprocess
@@ -338,20 +337,3 @@ def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
     process.terminate()
     reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
     raise RuntimeError(f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}")
-
-
-def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description="Picture of a recorded run as the viewer opens it.")
-    parser.add_argument("run", type=Path, help="folder of the run")
-    parser.add_argument("out", type=Path, help="PNG file to write")
-    parser.add_argument("--tab", default="Overview", help="name of a tab")
-    arguments = parser.parse_args()
-    try:
-        arguments.out.write_bytes(screenshot(arguments.run, arguments.tab))
-    except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"{error}")
-
-
-if __name__ == "__main__":
-    main()
