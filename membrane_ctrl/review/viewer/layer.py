@@ -235,7 +235,7 @@ class Layer:
 
     def _map(self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None) -> None:
         """Log a map at a second of the run, or for all of it."""
-        path, picture = f"{self._prefix}/shape/map/{kind}", values.astype(np.float16)
+        path, picture = f"{self._prefix}/shape/map/{kind}", np.nan_to_num(values).astype(np.float16)
         outside = rr.SegmentationImage(shapes.outside_disc(), opacity=1.0, draw_order=1.0)
         self._stream.log(f"{path}/outside", outside, static=True)
         if at_s is not None:
