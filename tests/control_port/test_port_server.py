@@ -142,10 +142,7 @@ async def test_gains_that_are_none_are_one_line(tmp_path: Path, loop: dict[str, 
 
 async def test_an_experiment_is_validated_and_handed_on(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, TOM) as tom:
-        assert (
-            "holding_flow_um_per_s: missing"
-            in (await tom.ask(do="tune", experiment={"kind": "relay"}))["refused"]
-        )
+        assert "holding_flow_um_per_s: missing" in (await tom.ask(do="tune", experiment={"kind": "relay"}))["refused"]
         spec = {"kind": "relay", "holding_flow_um_per_s": 1.2, "laser_um": 1.0}
         assert (await tom.ask(do="tune", experiment=spec))["ok"]
         assert run.asked[0].experiment is not None
