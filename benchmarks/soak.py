@@ -23,10 +23,10 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.bench_events import DailyTemperature, LaserDropout, PressureWeather
+from membrane_ctrl.sim.plant import BenchEvent, Plant
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import BenchEvent, DailyTemperature, LaserDropout, PressureWeather
 
 DAY_S = 86_400.0
 RATE_HZ = 10.0

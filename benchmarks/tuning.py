@@ -17,8 +17,7 @@ from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.sim import plant as twin_pump
-from membrane_ctrl.sim.plant import STEP_S, Plant
-from tests.support.bench_events import BenchEvent
+from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
 from tuning.identification.characterise import Characterised, characterise
 from tuning.identification.disturbance import observe
 from tuning.proposal.candidates import amigo, simc, ziegler_nichols

@@ -12,6 +12,9 @@ from membrane_ctrl.model import clock, errors, terminal
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
 
+twin_app = typer.Typer(
+    invoke_without_command=True, rich_markup_mode="markdown", help="Serve or play the simulated bench."
+)
 alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
 
 FlatOption = Annotated[
@@ -21,8 +24,9 @@ FlatOption = Annotated[
 
 def add_commands(app: typer.Typer) -> None:
     """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`."""
-    for command in (hold, twin, safe, check, devices, conformance):
+    for command in (hold, safe, check, devices, conformance):
         app.command()(command)
+    app.add_typer(twin_app, name="twin")
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
 
@@ -68,7 +72,9 @@ def hold(
     return hold_mirror(options)
 
 
+@twin_app.callback()
 def twin(
+    context: typer.Context,
     config: ConfigOption = None,
     speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")] = 1.0,
     from_flat: FlatOption = False,
@@ -76,7 +82,29 @@ def twin(
     """Serve the simulated bench over Modbus TCP, for any client, until interrupted."""
     from membrane_ctrl.sim.bench import serve_twin
 
+    if context.invoked_subcommand is not None:
+        return errors.Exit.DONE
     return serve_twin(_started(configured(config), from_flat), speed)
+
+
+@twin_app.command()
+def play(
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="Name or file; without it, the names are listed.")
+    ] = None,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Play in real time, with the console.")] = False,
+    name: Annotated[str | None, typer.Option(help="Name of the run folder; that of the scenario by default.")] = None,
+    logs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("logs"),
+) -> int:
+    """Play a scenario with its faults on the simulated bench, and record it as a run."""
+    if scenario is None:
+        from membrane_ctrl.hold.scenario import list_scenarios
+
+        return list_scenarios()
+    terminal.progress("loading the simulated bench")
+    from membrane_ctrl.hold.play import play_scenario
+
+    return play_scenario(scenario, logs, name, real_time)
 
 
 def safe(

@@ -20,10 +20,7 @@ from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import keys, model, why
 from membrane_ctrl.console.view import ConsolePage
-from membrane_ctrl.model import events, run_events, shape_estimate
-from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.model.terminal import Plain, in_foreground
+from membrane_ctrl.model import clock, events, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 
 # For a log file: one line per second, and these at once
@@ -86,7 +83,7 @@ _HANGS_S = 15.0
 class ConsoleSpec:
     """What the console needs to know about the run."""
 
-    clock: RunClock
+    clock: clock.RunClock
     telemetry: ring.RingAddress
     events: ring.RingAddress
     shapes: ring.RingAddress | None  # None for a run without a camera
@@ -152,7 +149,7 @@ class _Feed:
     def update(self) -> list[events.EventLine]:
         """Take all new messages; returns the events."""
         for message in self._telemetry.drain():
-            self.model.take_row(TelemetryRow.unpack(message))
+            self.model.take_row(telemetry.TelemetryRow.unpack(message))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(shape_estimate.unpack_estimate(message))
         lines: list[events.EventLine] = [json.loads(message) for message in self._events.drain()]
@@ -175,7 +172,7 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
 
         def show() -> None:
             feed.update()
-            if not in_foreground(handle):
+            if not terminal.in_foreground(handle):
                 live.stop()
                 return
             view = feed.model.view(spec.clock.now())
@@ -185,7 +182,7 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
                 desk.typed(reader.read(), view.paused)
                 page = ConsolePage(view, spec.config, run, desk.foot, desk.asks, desk.help)
             live.start()
-            live.update(Plain(page), refresh=True)
+            live.update(terminal.Plain(page), refresh=True)
 
         try:
             yield show

@@ -11,9 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
-from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.clock import RunClock, pause_s
-from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.model import clock, events, run_events, telemetry
 from membrane_ctrl.processes.child import Child, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
@@ -76,7 +74,7 @@ class ManagedChild:
                 said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
         # at once, then at growing intervals: a child that dies at its start must not keep the machine busy
-        if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
+        if now_s - self._ended_s >= clock.pause_s(len(self._replaced_s)):
             self.replace(now_s)
             said.append(run_events.ChildRestarted(name, self._count))
         return said
@@ -143,14 +141,14 @@ class Rings:
 def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
     """Make the rings; the stack frees their memory."""
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
-    telemetry = stack.enter_context(ring(kept, ROW_BYTES))
+    rows = stack.enter_context(ring(kept, telemetry.ROW_BYTES))
     events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
     inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
     camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
     if not camera or not config.shape.enabled:
-        return Rings(telemetry, events, inputs, None, None, truth)
+        return Rings(rows, events, inputs, None, None, truth)
     shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
-    return Rings(telemetry, events, inputs, shapes, _frames(config, stack), truth)
+    return Rings(rows, events, inputs, shapes, _frames(config, stack), truth)
 
 
 def _frames(config: Config, stack: ExitStack) -> FrameAddress:
@@ -167,7 +165,7 @@ class ChildProcesses:
     def __init__(
         self,
         config: Config,
-        clock: RunClock,
+        clock: clock.RunClock,
         rings: Rings,
         run_dir: Path,
         name: str,

@@ -30,9 +30,8 @@ from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench
-from membrane_ctrl.model import errors, run_events, terminal
+from membrane_ctrl.model import errors, events, run_events, terminal
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
@@ -96,7 +95,7 @@ def hold_mirror(options: HoldOptions) -> int:
         exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, latch, board))
         children.take_down()
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
-        _report(run_dir, options.json)
+        report(run_dir, options.json)
     return exit_code
 
 
@@ -183,7 +182,7 @@ async def _run(
     children: child_processes.ChildProcesses,
     twin: TwinProcess | None,
     port_for: Callable[[server.RunHooks], server.Port],
-    latch_for: Callable[[Callable[[Event], None]], FaultLatch],
+    latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
@@ -252,12 +251,12 @@ def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: 
 
 
 def _capture(
-    children: child_processes.ChildProcesses, tell: Callable[[Event], None], outputs: tick.TickOutputs
+    children: child_processes.ChildProcesses, tell: Callable[[events.Event], None], outputs: tick.TickOutputs
 ) -> None:
     """Pass accepted requests for a capture set to the acquisition."""
     for event in outputs.events:
         match event:
-            case CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
+            case events.CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
                 tell(failed)
 
 
@@ -281,7 +280,7 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
             signal.signal(number, handler)  # asyncio leaves the default: an end without clean-up
 
 
-def _report(run_dir: Path, as_json: bool) -> None:
+def report(run_dir: Path, as_json: bool) -> None:
     """Print the run's result and folder."""
     summary_path = run_dir / "summary.json"
     if as_json:

@@ -17,8 +17,7 @@ from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_row, pack_tick
-from membrane_ctrl.model import errors, run_events, shape_estimate
-from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model import clock, errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
@@ -47,7 +46,7 @@ class Wiring:
 class Supervisor:
     """Runs the ticks of one run, from the first one to the exit code."""
 
-    def __init__(self, controller: Controller, wiring: Wiring, clock: RunClock, rate_hz: float) -> None:
+    def __init__(self, controller: Controller, wiring: Wiring, clock: clock.RunClock, rate_hz: float) -> None:
         self._controller = controller
         self._wiring = wiring
         self._clock = clock

@@ -4,17 +4,17 @@ It lacks the latency of the link (a read is the plant's state at the tick, a wri
 processes and the deadlines. The board is the emulator's, with its watchdog, latches and limits, on the plant's time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from firmware_iface import roles
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller import controller, tick
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
-from membrane_ctrl.model import arrays, clock, errors, shape_estimate, telemetry
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
+from membrane_ctrl.processes import ring
 from membrane_ctrl.sim import truth_shape, virtual_bench
 
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
@@ -24,8 +24,8 @@ Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
 class VirtualTick:
     """One tick: what went in, and what came out."""
 
-    inputs: TickInputs
-    outputs: TickOutputs
+    inputs: tick.TickInputs
+    outputs: tick.TickOutputs
 
     @property
     def row(self) -> telemetry.TelemetryRow:
@@ -33,9 +33,20 @@ class VirtualTick:
         return self.outputs.row
 
     @property
-    def events(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[events.Event, ...]:
         """The tick's events."""
         return self.outputs.events
+
+
+@dataclass(frozen=True)
+class VirtualClock(clock.RunClock):
+    """The clock of a virtual run."""
+
+    seconds: Callable[[], float]
+
+    def now(self) -> float:
+        """Seconds of the run."""
+        return self.seconds()
 
 
 class VirtualRun:
@@ -52,6 +63,8 @@ class VirtualRun:
         Called with the time every `shape.period_s`; returns an estimate or None.
     alter : callable, optional
         Gets the time and the board's reading, returns what the controller reads.
+    rings : mapping of str to RingWriter, optional
+        Where to record the run: "telemetry", "inputs", "events" and "shapes".
     """
 
     def __init__(
@@ -61,8 +74,10 @@ class VirtualRun:
         sag_sensitivity: arrays.FloatArray,
         shape: truth_shape.ShapeSource | None = None,
         alter: Alter | None = None,
+        rings: Mapping[str, ring.RingWriter] | None = None,
     ) -> None:
         self._bench = bench
+        self._rings = rings or {}
         self._shape, self._alter = shape, alter
         self._shape_period_s = config.shape.period_s
         self._shape_due_s = 0.0
@@ -71,11 +86,17 @@ class VirtualRun:
         self._last_s = 0.0
         self.now_s = 0.0  # the run's clock
         self.finished: errors.Exit | None = None
+        self.clock = VirtualClock(0.0, datetime.now(UTC), lambda: self.now_s)
+        wiring = Wiring(
+            _AtOnce(bench, self._altered),
+            telemetry=self._rings.get("telemetry"),
+            events=self._rings.get("events"),
+            inputs=self._rings.get("inputs"),
+            shapes=self._newest_shape if shape else None,
+            truth=self._truth,
+        )
         self._supervisor = Supervisor(
-            Controller(config, sag_sensitivity),
-            Wiring(_AtOnce(bench, self._altered), shapes=self._newest_shape if shape else None, truth=self._truth),
-            clock.RunClock.start(),  # for the events' stamps, which are not recorded
-            config.loop.rate_hz,
+            controller.Controller(config, sag_sensitivity), wiring, self.clock, config.loop.rate_hz
         )
         bench.open()
 
@@ -101,11 +122,25 @@ class VirtualRun:
             self._bench.close()
         return VirtualTick(inputs, outputs)
 
+    def tell(self, event: events.Event) -> None:
+        """Record an event, now."""
+        self._supervisor.tell(event)
+
+    def end(self) -> None:
+        """Record the end of the run."""
+        supervisor, exit_ = self._supervisor, self.finished or errors.Exit.INTERRUPTED
+        self.tell(run_events.Ended(exit_.name.lower(), int(exit_), supervisor.ticks, supervisor.missed_ticks))
+
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._shape is None or self.now_s < self._shape_due_s:
             return None
         self._shape_due_s += self._shape_period_s
-        return self._shape(self.now_s)
+        estimate = self._shape(self.now_s)
+        if estimate is None or "shapes" not in self._rings:
+            return estimate
+        message = shape_estimate.pack_estimate(estimate)
+        self._rings["shapes"].put(message)
+        return shape_estimate.unpack_estimate(message)  # the record is then exact
 
     def _truth(self) -> tuple[float, float]:
         return self._bench.truth.displacement_um, self._bench.truth.laser_bias_um

@@ -66,11 +66,16 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     # Ctrl-C reaches the whole terminal group, but the supervisor ends the run, with the "end" event
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda *_: asked.set())
-    os.environ["RUST_LOG"] = "off"  # Rerun's own log would spoil the console; its errors come as exceptions
-    # read at Rerun's import: makes its allocator free a closed segment's memory at once, else 30 MB would stay
-    os.environ["MIMALLOC_PURGE_DELAY"] = "0"
+    prepare_rerun()
     if not _record(spec, reporter(status), asked.is_set, lambda: not parent_lives()):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
+
+
+def prepare_rerun() -> None:
+    """Set what Rerun reads when it is imported."""
+    os.environ["RUST_LOG"] = "off"  # its own log would spoil the console; its errors come as exceptions
+    # makes its allocator free a closed segment's memory at once, else 30 MB would stay
+    os.environ["MIMALLOC_PURGE_DELAY"] = "0"
 
 
 def _record(

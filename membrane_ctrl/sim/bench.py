@@ -13,9 +13,7 @@ from multiprocessing.connection import Connection
 from firmware_iface.emulators import board_state, pump_board
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
-from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.errors import DeviceError, Exit
-from membrane_ctrl.model.terminal import progress
+from membrane_ctrl.model import clock, errors, terminal
 from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.sim.lab import Lab
@@ -32,7 +30,7 @@ class BenchSpec:
 
     twin: TwinConfig
     pump: PumpConfig
-    clock: RunClock  # the run's clock, which stamps the truth
+    clock: clock.RunClock  # the run's clock, which stamps the truth
     port: int  # where to listen; 0: any free port
     only_there: bool = True  # False: at any free port if this one is taken
     host: str = "127.0.0.1"
@@ -185,21 +183,21 @@ _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
     """Start the bench process, which the stack ends, and wait until it listens; print where. Raises DeviceError."""
-    progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
+    terminal.progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
     ours, theirs = pipe()
     child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
     stack.callback(child.stop, 2.0)
     child.start()
     report: BenchReport = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
     if report.error:
-        raise DeviceError(report.error)
+        raise errors.DeviceError(report.error)
     if spec.lab is None:
         moved = f" (port {spec.port} is taken)" if spec.port not in (0, report.port) else ""
-        progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
+        terminal.progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
     return report
 
 
-def _spec(config: Config, clock: RunClock) -> BenchSpec:
+def _spec(config: Config, clock: clock.RunClock) -> BenchSpec:
     """The bench of a configuration; the default port may be another twin's, a configured one is meant."""
     twin = config.twin
     return BenchSpec(twin, config.pump, clock, twin.port, only_there="port" in twin.model_fields_set)
@@ -214,7 +212,7 @@ class TwinProcess:
 
     @classmethod
     def started(
-        cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False
+        cls, config: Config, clock: clock.RunClock, stack: contextlib.ExitStack, lab: bool = False
     ) -> "TwinProcess":
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
 
@@ -249,8 +247,8 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 def serve_twin(config: Config, speed: float) -> int:
     """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a busy port."""
     with contextlib.ExitStack() as stack:
-        _started(replace(_spec(config, RunClock.start()), speed=speed, linger_s=0.0), stack)
-        progress("stop it with Ctrl-C")
+        _started(replace(_spec(config, clock.RunClock.start()), speed=speed, linger_s=0.0), stack)
+        terminal.progress("stop it with Ctrl-C")
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
-    return Exit.INTERRUPTED if stopped == signal.SIGINT else Exit.DONE
+    return errors.Exit.INTERRUPTED if stopped == signal.SIGINT else errors.Exit.DONE

@@ -12,11 +12,16 @@ from pathlib import Path
 
 from firmware_iface import settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
-from firmware_iface.emulators import bronkhorst, modbus_server, pump_board, serial_device
-from firmware_iface.emulators.keyence_dl_rs1a import KeyenceDlRs1aEmulator
-from firmware_iface.emulators.optoncdt1420 import Optoncdt1420Emulator
-from firmware_iface.emulators.vaisala_ptb330 import VaisalaPtb330Emulator
-from firmware_iface.emulators.ventus import VentusEmulator
+from firmware_iface.emulators import (
+    bronkhorst,
+    keyence_dl_rs1a,
+    modbus_server,
+    optoncdt1420,
+    pump_board,
+    serial_device,
+    vaisala_ptb330,
+    ventus,
+)
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.instruments.bench import map_keys
@@ -102,11 +107,11 @@ class Lab:
     def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
             case settings.Optoncdt1420Config():
-                return Optoncdt1420Emulator(
+                return optoncdt1420.Optoncdt1420Emulator(
                     self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
                 )
             case settings.KeyenceDlRs1aConfig():
-                return KeyenceDlRs1aEmulator(
+                return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
                     self._sensor("displacement"),
                     section.direction,
                     section.baud,
@@ -114,9 +119,9 @@ class Lab:
                     section.amplifier + 1,
                 )
             case settings.VaisalaPtb330Config():
-                return VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+                return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
             case settings.VentusConfig():
-                return VentusEmulator(self._actuator("pump"), section.power_max_mw)
+                return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
             case settings.BronkhorstProparConfig():
                 return bronkhorst.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)

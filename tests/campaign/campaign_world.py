@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.plant import STEP_S, Plant
-from tests.support.bench_events import BenchEvent
+from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
 
 SCENARIOS = ("calm", "quiet", "typical", "gusty")
 NOMINAL_SEEDS = range(1, 3)  # the twin as it is; all other seeds draw a mirror

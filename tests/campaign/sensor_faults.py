@@ -23,12 +23,12 @@ from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
-from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.plant import BenchEvent, Plant
 from membrane_ctrl.sim.sensors import Truth
 from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import AmbientChange, BenchEvent
 
 RATE_HZ = 10.0
 REGISTER_MAX = 2e6  # a value that does not fit a register of the board is sent as no value

@@ -15,18 +15,18 @@ from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
 from membrane_ctrl.sim import sensors as sensors_module
-from membrane_ctrl.sim.film import Film
-from membrane_ctrl.sim.truth_shape import TruthShape
-from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.bench_events import (
+from membrane_ctrl.sim.bench_events import (
     AmbientChange,
-    BenchEvent,
     DailyTemperature,
     LaserDrift,
     LaserDropout,
     LeakChange,
     PressureWeather,
 )
+from membrane_ctrl.sim.film import Film
+from membrane_ctrl.sim.plant import BenchEvent
+from membrane_ctrl.sim.truth_shape import TruthShape
+from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _DROPOUT = "displacement_missing"  # five seconds without light are a true alarm
 

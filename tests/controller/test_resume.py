@@ -11,12 +11,13 @@ from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, Resume
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
+from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.scenario import At, Expectation, Scenario, play
+from tests.support.scenario import CheckedScenario, Expectation, play
 
 RULES = {rule.name: rule for rule in TABLE}
 LINK_LOST, LATE = RULES["link_lost"], RULES["late"]
@@ -126,8 +127,8 @@ def test_the_days_number_is_used_up_and_comes_back_a_day_after() -> None:
         assert fault.rule.possible is possible, now_s
 
 
-def scenario(*at: At, duration_s: float, faults: tuple[str, ...]) -> Scenario:
-    return Scenario.model_validate(
+def scenario(*at: At, duration_s: float, faults: tuple[str, ...]) -> CheckedScenario:
+    return CheckedScenario.model_validate(
         {
             "title": "resume",
             "duration_s": duration_s,

@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.model.states import State
 from membrane_ctrl.model.telemetry import TelemetryRow
-from tests.support.scenario import Scenario, play
+from tests.support.scenario import CheckedScenario, play
 
 SEEN = ("filtered_um", "leak_um_per_s")
 
@@ -28,7 +28,7 @@ def rows() -> list[TelemetryRow]:
         {"time_s": 100.0, "command": "lower"},
     ]
     about = {"title": "rows", "duration_s": 110.0, "config": {"loop": {"rate_hz": 10.0}}, "at": at, "expect": {}}
-    return [tick.row for tick in play(Scenario.model_validate(about)).ticks]
+    return [tick.row for tick in play(CheckedScenario.model_validate(about)).ticks]
 
 
 def between(rows: list[TelemetryRow], start_s: float, end_s: float) -> list[TelemetryRow]:

@@ -9,14 +9,14 @@ import pytest
 
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.states import Rung, State
-from tests.support.scenario import Outcome, Scenario, play
+from tests.support.scenario import CheckedScenario, Outcome, play
 
 
 def played(*at: dict[str, Any], duration_s: float = 60.0, **config: Any) -> Outcome:
     states = {"stay_after_trip": True, **config.pop("states", {})}
     config = {"loop": {"rate_hz": 10.0}, "states": states, **config}
     return play(
-        Scenario.model_validate(
+        CheckedScenario.model_validate(
             {"title": "states", "duration_s": duration_s, "config": config, "at": at, "expect": {}}
         )
     )

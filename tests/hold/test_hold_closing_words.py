@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.hold.start import _report
+from membrane_ctrl.hold.start import report
 
 
 def words(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    _report(run_dir, as_json=False)
+    report(run_dir, as_json=False)
     return capsys.readouterr().err
 
 

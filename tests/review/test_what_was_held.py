@@ -17,7 +17,7 @@ from membrane_ctrl.review.catalogue import entry
 from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.run_files.summary import HoldParts, Summary
-from tests.support.scenario import Scenario, play
+from tests.support.scenario import CheckedScenario, play
 
 RATE_HZ = 10.0
 
@@ -33,7 +33,7 @@ def rows() -> Rows:
         {"time_s": 320.0, "wrong": "no_light", "for_s": 8.0},
     ]
     about = {"title": "held", "duration_s": 420.0, "config": {"loop": {"rate_hz": RATE_HZ}}, "at": at, "expect": {}}
-    return unpack([tick.row.pack() for tick in play(Scenario.model_validate(about)).ticks])
+    return unpack([tick.row.pack() for tick in play(CheckedScenario.model_validate(about)).ticks])
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.bench_events import BenchEvent, DailyTemperature, PressureWeather, Surroundings
+from membrane_ctrl.sim.bench_events import DailyTemperature, PressureWeather
+from membrane_ctrl.sim.plant import BenchEvent, Surroundings
 
 DAY_S = 86_400.0
 

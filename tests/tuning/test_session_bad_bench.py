@@ -12,7 +12,8 @@ from membrane_ctrl.model.errors import RejectedError
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError
-from tests.support.bench_events import AmbientChange, BenchEvent
+from membrane_ctrl.sim.bench_events import AmbientChange
+from membrane_ctrl.sim.plant import BenchEvent
 from tuning import session
 from tuning.identification.characterise import characterise, spec_of
 from tuning.rig import HoldRig

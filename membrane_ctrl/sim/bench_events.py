@@ -1,15 +1,11 @@
 """Events of the simulated bench at a time; each adds its effect to the surroundings."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.sim.plant import BenchEvent as BenchEvent
-from membrane_ctrl.sim.plant import Series
-from membrane_ctrl.sim.plant import Surroundings as Surroundings
+from membrane_ctrl.sim.plant import Series, Surroundings
 
 _DAY_S = 86_400.0
 

@@ -1,0 +1,185 @@
+"""Scenarios: what happens to a simulated bench and when. One TOML file each (docs/scenarios.md)."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+from pydantic import Field, model_validator
+
+from firmware_iface.settings import Section
+from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.processes.ring import RingWriter
+from membrane_ctrl.sim import bench_events, plant, truth_shape, virtual_bench
+
+_SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
+_FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
+_REPEATS_MAX = 100_000
+_AFTERMATH_S = 60.0  # a run whose process stands still never ends by itself
+Happening = Literal[
+    "ambient", "air_temperature", "leak", "laser_dropout", "laser_drift",
+    "daily_temperature", "pressure_weather", "power_cycle",
+]  # fmt: skip
+_MAKE: dict[str, Callable[[At], plant.BenchEvent]] = {
+    "ambient": lambda at: bench_events.AmbientChange(at.time_s, at.value, at.over_s),
+    "air_temperature": lambda at: bench_events.AirTemperatureChange(at.time_s, at.value, at.over_s),
+    "leak": lambda at: bench_events.LeakChange(at.time_s, at.value),
+    "laser_dropout": lambda at: bench_events.LaserDropout(at.time_s, at.over_s),
+    "laser_drift": lambda at: bench_events.LaserDrift(at.time_s, at.value, at.over_s or math.inf),
+    "daily_temperature": lambda at: bench_events.DailyTemperature(at.value),
+    "pressure_weather": lambda at: bench_events.PressureWeather(at.value),
+}
+
+
+class At(Section):
+    """One thing that happens: exactly one of `wrong`, `event` and `command`."""
+
+    time_s: Annotated[float, Field(ge=0)]
+    wrong: str | None = None
+    for_s: Annotated[float, Field(gt=0)] | None = None
+    every_s: Annotated[float, Field(ge=1e-3)] | None = None
+    event: Happening | None = None
+    over_s: Annotated[float, Field(ge=0)] = 0.0
+    command: str | None = None
+    value: float = 1.0
+    text: str = ""
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> At:
+        if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
+            raise ValueError("give exactly one of wrong, event and command")
+        if self.wrong is not None and self.wrong not in _SWITCHES:
+            raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {', '.join(_SWITCHES)}")
+        if self.wrong in _FRACTIONS and not 0 <= self.value <= 1:
+            raise ValueError(f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1")
+        if self.for_s is not None and self.wrong is None:
+            raise ValueError("for_s goes with wrong; an event has over_s")
+        if self.over_s and self.event is None:
+            raise ValueError("over_s goes with event; what is wrong has for_s")
+        if self.every_s is not None and (self.wrong is None or self.for_s is None or self.for_s >= self.every_s):
+            raise ValueError("every_s goes with wrong and with a for_s shorter than it")
+        if self.command is not None and self.command not in get_args(Kind):
+            raise ValueError(f"command = {self.command!r} is unknown; known are {', '.join(get_args(Kind))}")
+        return self
+
+
+class Scenario(Section):
+    """One scenario file; `expect` is for the tests."""
+
+    title: str
+    duration_s: Annotated[float, Field(gt=0, le=1e7)] = 60.0
+    shapes: bool = False  # the camera measures; its shapes are made from the truth
+    config: schema.Config = schema.Config()
+    at: tuple[At, ...] = ()
+    expect: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _before_the_end(self) -> Scenario:
+        for number, at in enumerate(self.at):
+            if at.time_s >= self.duration_s:
+                raise ValueError(
+                    f"at.{number}: time_s = {at.time_s:g} is not before duration_s = {self.duration_s:g}"
+                )
+            if at.every_s is not None and self.duration_s / at.every_s > _REPEATS_MAX:
+                raise ValueError(f"at.{number}: every_s = {at.every_s:g} repeats more than {_REPEATS_MAX} times")
+        return self
+
+
+S = TypeVar("S", bound=Scenario)
+_FOLDER = Path(__file__).parent / "scenarios"
+
+
+def load_scenario(path: Path, model: type[S]) -> S:
+    """Read a scenario. Raises InputError: one line that names the file, the field and what would be right."""
+    return toml_file.load(path, model)
+
+
+def shipped() -> list[Path]:
+    """Files of the scenarios that come with the program; a name is the file's without its suffix."""
+    return sorted(_FOLDER.glob("*.toml"))
+
+
+def list_scenarios() -> int:
+    """Print names and titles of the scenarios that come with the program."""
+    for path in shipped():
+        print(f"{path.stem:18} {toml_file.read_toml(path)['title']}")
+    return Exit.DONE
+
+
+def find_scenario(word: str) -> Path:
+    """The file of a scenario, given its name or a path. Raises InputError."""
+    named = _FOLDER / f"{word.replace('-', '_')}.toml"
+    path = named if named in shipped() else Path(word)
+    if not path.is_file():
+        raise InputError(f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file")
+    return path
+
+
+Due = Command | Callable[[virtual_bench.VirtualBench], None]
+Ticks = Iterable[VirtualTick | None]  # None: the control process misses one
+
+
+class ScenarioRun:
+    """A scenario in virtual time, from the request to hold until its end; `rings` as in `VirtualRun`."""
+
+    def __init__(self, scenario: Scenario, rings: Mapping[str, RingWriter] | None = None) -> None:
+        self.config = config = scenario.config
+        self.stopped = False  # before its end
+        steps = sorted(scenario.at, key=lambda at: at.time_s)
+        mirror = plant.Plant(
+            config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE)
+        )
+        self.bench = virtual_bench.VirtualBench(mirror, config.devices.watchdog_s if config.devices else 0.5)
+        shape = truth_shape.TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
+        self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
+        self._ends_s = scenario.duration_s
+        begin, end = (0.0, Command("hold", "scenario")), (scenario.duration_s, Command("stop", "duration"))
+        agenda: list[tuple[float, Due]] = [begin, *_agenda(steps, scenario.duration_s), end]
+        self._agenda = deque(sorted(agenda, key=lambda entry: entry[0]))
+
+    def ticks(self) -> Ticks:
+        """Run tick after tick."""
+        run = self.virtual
+        while run.finished is None and run.now_s < self._ends_s + _AFTERMATH_S:
+            commands: list[Command] = []
+            while self._agenda and self._agenda[0][0] <= run.now_s:
+                _, due = self._agenda.popleft()
+                if isinstance(due, Command):
+                    commands.append(due)
+                else:
+                    due(self.bench)
+            yield run.tick(tuple(commands))
+
+    def stop(self, who: str) -> None:
+        """End the run now."""
+        self.stopped, self._ends_s = True, self.virtual.now_s
+        self._agenda = deque([(0.0, Command("stop", who))])
+
+
+def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
+    """What is to be done when; a switch returns to its default when its time is over."""
+    for at in steps:
+        if at.command is not None:
+            command = Command(at.command, "scenario", value=at.value, text=at.text)  # type: ignore[arg-type]  # checked
+            yield at.time_s, command
+        elif at.wrong is not None:
+            times = 1 if at.every_s is None else max(1, math.ceil((end_s - at.time_s) / at.every_s))
+            for begin_s in (at.time_s + k * (at.every_s or 0.0) for k in range(times)):
+                yield begin_s, _switch(at.wrong, at.value)
+                if at.for_s is not None:
+                    yield begin_s + at.for_s, _switch(at.wrong, _SWITCHES[at.wrong])
+        elif at.event == "power_cycle":
+            yield at.time_s, virtual_bench.VirtualBench.power_cycle
+
+
+def _switch(name: str, value: Any) -> Callable[[virtual_bench.VirtualBench], None]:
+    kind = type(_SWITCHES[name])
+    return lambda bench: setattr(bench.wrong, name, kind(value))
