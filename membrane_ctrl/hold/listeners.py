@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
-from types import TracebackType
 
 from membrane_ctrl.controller import commands, tick
 from membrane_ctrl.model import events, run_events, run_status, states
@@ -68,9 +67,7 @@ class FaultLatch:
                 self._file.reserve()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._file is not None:
             self._disk.submit(self._settle, self._file)
         self._disk.shutdown()
@@ -158,9 +155,7 @@ class SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._send("STOPPING=1")
         self._socket.close()
 

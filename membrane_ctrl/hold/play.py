@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.console import process as console
-from membrane_ctrl.console import why
+from membrane_ctrl.console import process, why
 from membrane_ctrl.controller import tick
 from membrane_ctrl.hold import scenario, start
 from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
@@ -41,7 +40,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
         ticks: scenario.Ticks = run.ticks()
         if real_time:
             ticks = _paced(run, ticks)
-            spec = console.ConsoleSpec(
+            spec = process.ConsoleSpec(
                 clock.RunClock.start(), addresses["telemetry"], addresses["events"], addresses["shapes"], run_dir,
                 config, played.duration_s,
             )  # fmt: skip
@@ -75,24 +74,23 @@ def _record(
 ) -> None:
     """Run all ticks and record them, in this process: virtual time waits for the disk."""
     prepare_rerun()
-    from membrane_ctrl.recorder.recorder import Recorder
-    from membrane_ctrl.recorder.sink import Recording
+    from membrane_ctrl.recorder import recorder, sink
 
     virtual, config = run.virtual, run.config
     recorded = ("inputs", "events", "shapes")
     with contextlib.ExitStack() as stack:
         readers = {n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n]))) for n in recorded}
-        recording = Recording(run_dir, name, virtual.clock, config)
-        recorder = Recorder(run_dir, virtual.clock, config, readers, recording, None, virtual.tell)
+        recording = sink.Recording(run_dir, name, virtual.clock, config)
+        files = recorder.Recorder(run_dir, virtual.clock, config, readers, recording, None, virtual.tell)
         virtual.tell(run_events.Started("the twin in virtual time", "ordinary", ""))
         due_s = round_s
         for _ in ticks:
             if virtual.now_s >= due_s:
                 due_s += round_s
-                recorder.drain()
-                recorder.write()
+                files.drain()
+                files.write()
         virtual.end()
-        recorder.finish()
+        files.finish()
 
 
 def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks) -> scenario.Ticks:
@@ -103,7 +101,7 @@ def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks) -> scenario.Ticks:
         time.sleep(max(0.0, begin_s + run.virtual.now_s - time.monotonic()))
 
 
-def _show(spec: console.ConsoleSpec, stack: contextlib.ExitStack) -> None:
+def _show(spec: process.ConsoleSpec, stack: contextlib.ExitStack) -> None:
     """Start a console, which ends with the "end" event; the stack waits for it."""
     screen = child.Child("screen", "membrane_ctrl.console.process:console_main", (spec,), nice=5)
     stack.callback(screen.stop, 0.0)

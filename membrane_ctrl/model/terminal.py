@@ -12,7 +12,6 @@ import signal
 import sys
 import unicodedata
 from collections.abc import Iterable, Iterator
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar, cast
 
 if TYPE_CHECKING:  # commands without a table need not load it
@@ -152,5 +151,5 @@ def ends_as_by_ctrl_c() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt

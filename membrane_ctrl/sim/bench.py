@@ -14,11 +14,8 @@ from firmware_iface.emulators import board_state, pump_board
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
 from membrane_ctrl.model import clock, errors, terminal
-from membrane_ctrl.processes.child import STOP, Child, parent_lives, pipe, raise_priority
-from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
-from membrane_ctrl.sim.lab import Lab
-from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
-from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
+from membrane_ctrl.processes import child, ring
+from membrane_ctrl.sim import lab, plant, sensors
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each sample is on time
 _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
@@ -35,10 +32,10 @@ class BenchSpec:
     only_there: bool = True  # False: at any free port if this one is taken
     host: str = "127.0.0.1"
     speed: float = 1.0  # plant seconds a second
-    truth: RingAddress | None = None  # where to publish `Truth.pack()` with every sample
+    truth: ring.RingAddress | None = None  # where to publish `Truth.pack()` with every sample
     # how long the bench outlives the process that started it, so that the tripped watchdog can be observed
     linger_s: float = 5.0
-    events: tuple[BenchEvent, ...] = ()  # events in plant time (0 at the start)
+    events: tuple[plant.BenchEvent, ...] = ()  # events in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
 
 
@@ -64,13 +61,13 @@ def serve(spec: BenchSpec, ready: Connection) -> None:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
-        raise_priority()  # it stands for devices with their own processors; at higher speeds it may use a whole core
+        child.raise_priority()  # it stands for devices with processors of their own; faster, it may use a whole core
     asyncio.run(_serve(spec, ready))
 
 
 async def _serve(spec: BenchSpec, ready: Connection) -> None:
     stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(STOP, stop.set)
+    asyncio.get_running_loop().add_signal_handler(child.STOP, stop.set)
     with _truth_writer(spec.truth) as writer:
         try:
             bench = LiveBench(spec, writer)
@@ -93,11 +90,11 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
 
 async def _listening(
     bench: "LiveBench", spec: BenchSpec
-) -> tuple[pump_board.PumpBoardEmulator | Lab, DevicesConfig | None]:
+) -> tuple[pump_board.PumpBoardEmulator | lab.Lab, DevicesConfig | None]:
     """The emulated board or instruments, and the addresses of the latter. Raises OSError."""
     if spec.lab is not None:
-        lab = Lab(bench, spec.lab)
-        return lab, await lab.start()
+        instruments = lab.Lab(bench, spec.lab)
+        return instruments, await instruments.start()
     board = pump_board.PumpBoardEmulator(bench, spec.host, spec.port)
     try:
         await board.start()
@@ -116,7 +113,7 @@ async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event
     while not stop.is_set():
         bench.catch_up()
         now_s = time.monotonic()
-        if orphaned_s is None and not parent_lives():
+        if orphaned_s is None and not child.parent_lives():
             orphaned_s = now_s
         if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
             return
@@ -125,11 +122,11 @@ async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event
 
 
 @contextlib.contextmanager
-def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
+def _truth_writer(address: ring.RingAddress | None) -> Iterator[ring.RingWriter | None]:
     if address is None:
         yield None
         return
-    writer = RingWriter(address)
+    writer = ring.RingWriter(address)
     try:
         yield writer
     finally:
@@ -139,8 +136,8 @@ def _truth_writer(address: RingAddress | None) -> Iterator[RingWriter | None]:
 class LiveBench:
     """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the truth with each."""
 
-    def __init__(self, spec: BenchSpec, truth: RingWriter | None) -> None:
-        self._plant = Plant(spec.twin, spec.pump, spec.events)
+    def __init__(self, spec: BenchSpec, truth: ring.RingWriter | None) -> None:
+        self._plant = plant.Plant(spec.twin, spec.pump, spec.events)
         self._now = spec.clock.now
         self._start_s = spec.clock.now()
         self._speed = spec.speed
@@ -161,18 +158,18 @@ class LiveBench:
         Of several samples due, a client could see only the last; the counter counts all.
         """
         due_s = (self._now() - self._start_s) * self._speed - self._plant.time_s
-        steps = min(int(due_s / STEP_S), _STEPS_AT_ONCE)
+        steps = min(int(due_s / plant.STEP_S), _STEPS_AT_ONCE)
         if steps > 0:
-            self._plant.advance(steps * STEP_S)
+            self._plant.advance(steps * plant.STEP_S)
             self._sample = self._take_sample()
 
     def _take_sample(self) -> board_state.BoardSample:
-        plant = self._plant
+        mirror = self._plant
         if self._truth is not None:
-            truth = plant.truth()
+            truth = mirror.truth()
             self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
-        sample = plant.sample()
-        return replace(sample, sample_counter=round(sample.device_time_s / STEP_S) + 1)
+        sample = mirror.sample()
+        return replace(sample, sample_counter=round(sample.device_time_s / plant.STEP_S) + 1)
 
 
 # The twin as a process beside the hold: its start, its port, and its truth for the record.
@@ -184,10 +181,10 @@ _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
     """Start the bench process, which the stack ends, and wait until it listens; print where. Raises DeviceError."""
     terminal.progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
-    ours, theirs = pipe()
-    child = Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
-    stack.callback(child.stop, 2.0)
-    child.start()
+    ours, theirs = child.pipe()
+    process = child.Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
+    stack.callback(process.stop, 2.0)
+    process.start()
     report: BenchReport = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
     if report.error:
         raise errors.DeviceError(report.error)
@@ -208,7 +205,7 @@ class TwinProcess:
     """A running simulated bench."""
 
     config: Config  # the run's configuration with the twin's own address as its device
-    truth: RingAddress  # where the twin publishes its mirror's true state
+    truth: ring.RingAddress  # where the twin publishes its mirror's true state
 
     @classmethod
     def started(
@@ -218,7 +215,7 @@ class TwinProcess:
 
         With `lab` it answers as the configured instruments, else as the pump board.
         """
-        truth = stack.enter_context(ring(_TRUTHS_KEPT, TRUTH_BYTES))
+        truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, sensors.TRUTH_BYTES))
         spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = _started(spec, stack)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
@@ -227,13 +224,13 @@ class TwinProcess:
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
         """A function that returns the newest true displacement and laser bias, in um."""
-        reader = RingReader(self.truth)
+        reader = ring.RingReader(self.truth)
 
         def newest() -> tuple[float, float]:
             message = reader.latest()
             if message is None:
                 return float("nan"), float("nan")
-            truth = Truth.unpack(message)
+            truth = sensors.Truth.unpack(message)
             return truth.displacement_um, truth.laser_bias_um
 
         return newest
