@@ -39,12 +39,10 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
         terminal.progress(f"playing {why.duration(played.duration_s)} of: {played.title}")
         ticks: scenario.Ticks = run.ticks()
         if real_time:
-            ticks = _paced(run, ticks)
-            spec = process.ConsoleSpec(
-                clock.RunClock.start(), addresses["telemetry"], addresses["events"], addresses["shapes"], run_dir,
-                config, played.duration_s,
-            )  # fmt: skip
-            _show(spec, stack)
+            real = clock.RunClock.start()
+            ticks = _paced(run, ticks, real)
+            rows, events, shapes = (addresses[n] for n in ("telemetry", "events", "shapes"))
+            _show(process.ConsoleSpec(real, rows, events, shapes, run_dir, config, played.duration_s), stack)
         else:
             ticks = terminal.counted(ticks, "playing", round(played.duration_s * config.loop.rate_hz))
         with _stopped_by_signals(run):
@@ -93,12 +91,11 @@ def _record(
         files.finish()
 
 
-def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks) -> scenario.Ticks:
-    """The ticks, each at its time."""
-    begin_s = time.monotonic()
+def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks, real: clock.RunClock) -> scenario.Ticks:
+    """The ticks, each at its time; late ones follow at once."""
     for each in ticks:
+        time.sleep(max(0.0, run.virtual.now_s - real.now()))
         yield each
-        time.sleep(max(0.0, begin_s + run.virtual.now_s - time.monotonic()))
 
 
 def _show(spec: process.ConsoleSpec, stack: contextlib.ExitStack) -> None:

@@ -128,7 +128,8 @@ class VirtualRun:
 
     def end(self) -> None:
         """Record the end of the run."""
-        supervisor, exit_ = self._supervisor, self.finished or errors.Exit.INTERRUPTED
+        supervisor = self._supervisor
+        exit_ = errors.Exit.INTERRUPTED if self.finished is None else self.finished
         self.tell(run_events.Ended(exit_.name.lower(), int(exit_), supervisor.ticks, supervisor.missed_ticks))
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
