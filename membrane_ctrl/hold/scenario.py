@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -14,10 +14,9 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.hold.virtual_run import Rings, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import Exit, InputError
-from membrane_ctrl.processes.ring import RingWriter
 from membrane_ctrl.sim import bench_events, plant, truth_shape, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
@@ -130,7 +129,7 @@ Ticks = Iterable[VirtualTick | None]  # None: the control process misses one
 class ScenarioRun:
     """A scenario in virtual time, from the request to hold until its end; `rings` as in `VirtualRun`."""
 
-    def __init__(self, scenario: Scenario, rings: Mapping[str, RingWriter] | None = None) -> None:
+    def __init__(self, scenario: Scenario, rings: Rings | None = None) -> None:
         self.config = config = scenario.config
         self.stopped = False  # before its end
         steps = sorted(scenario.at, key=lambda at: at.time_s)

@@ -10,13 +10,13 @@ from datetime import UTC, datetime
 
 from firmware_iface import roles
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller import controller, tick
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller import commands, controller, tick
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
 from membrane_ctrl.processes import ring
 from membrane_ctrl.sim import truth_shape, virtual_bench
 
+Rings = Mapping[str, ring.RingWriter]
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
 
 
@@ -74,7 +74,7 @@ class VirtualRun:
         sag_sensitivity: arrays.FloatArray,
         shape: truth_shape.ShapeSource | None = None,
         alter: Alter | None = None,
-        rings: Mapping[str, ring.RingWriter] | None = None,
+        rings: Rings | None = None,
     ) -> None:
         self._bench = bench
         self._rings = rings or {}
@@ -100,7 +100,7 @@ class VirtualRun:
         )
         bench.open()
 
-    def tick(self, commands: tuple[Command, ...] = ()) -> VirtualTick | None:
+    def tick(self, commands: tuple[commands.Command, ...] = ()) -> VirtualTick | None:
         """Advance one period and run a tick; None if the control process does not run."""
         self._steps += 1
         self.now_s = self._steps * self._period_s  # no sum, which would drift

@@ -1,6 +1,5 @@
 """Events of the simulated bench at a time; each adds its effect to the surroundings."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +65,7 @@ class LaserDrift:
 
     at_s: float
     rate_um_per_min: float
-    duration_s: float = math.inf
+    duration_s: float = np.inf
 
     def apply(self, on: Surroundings) -> None:
         """Add the motion so far."""
@@ -82,7 +81,7 @@ class DailyTemperature:
 
     def apply(self, on: Surroundings) -> None:
         """Add the day's course."""
-        on.air_k[:] += self.amplitude_k * np.cos(2 * math.pi / _DAY_S * (on.time_s - self.warmest_s))
+        on.air_k[:] += self.amplitude_k * np.cos(2 * np.pi / _DAY_S * (on.time_s - self.warmest_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +98,10 @@ class PressureWeather:
     def apply(self, on: Surroundings) -> None:
         """Add the weather."""
         periods_s = np.geomspace(0.5 * _DAY_S, 10 * _DAY_S, 12)
-        phases = np.random.default_rng(self.seed).uniform(0, 2 * math.pi, periods_s.size)
+        phases = np.random.default_rng(self.seed).uniform(0, 2 * np.pi, periods_s.size)
         for period_s, phase in zip(periods_s, phases, strict=True):
-            wave = np.sin(2 * math.pi / period_s * on.time_s + phase) - math.sin(phase)
-            on.ambient_pa[:] += self.std_pa * math.sqrt(2 / periods_s.size) * wave
+            wave = np.sin(2 * np.pi / period_s * on.time_s + phase) - np.sin(phase)
+            on.ambient_pa[:] += self.std_pa * np.sqrt(2 / periods_s.size) * wave
 
 
 def _progress(time_s: Series, at_s: float, over_s: float) -> Series:
