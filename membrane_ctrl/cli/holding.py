@@ -12,9 +12,7 @@ from membrane_ctrl.model import clock, errors, terminal
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
 
-twin_app = typer.Typer(
-    invoke_without_command=True, rich_markup_mode="markdown", help="Serve or play the simulated bench."
-)
+twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
 
 FlatOption = Annotated[
@@ -79,7 +77,7 @@ def twin(
     speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")] = 1.0,
     from_flat: FlatOption = False,
 ) -> int:
-    """Serve the simulated bench over Modbus TCP, for any client, until interrupted."""
+    """Serve the simulated bench over Modbus TCP, for any client, until interrupted; or `play` a scenario on it."""
     from membrane_ctrl.sim.bench import serve_twin
 
     if context.invoked_subcommand is not None:
