@@ -84,6 +84,11 @@ def test_an_impossible_time_has_no_utc() -> None:
     ]  # fmt: skip
 
 
+def test_a_code_that_was_not_recorded_is_null() -> None:
+    table = named_table({"mono_s": np.arange(3.0), "state": np.array([np.nan, 4.0, 0.0])}, ORIGIN)
+    assert table.column("state").to_pylist() == [None, "hold", "standby"]
+
+
 def test_a_part_without_data_has_the_same_columns(folder: Path) -> None:
     run = open_run(folder)
     for whole, none in ((run.ticks(), run.ticks(start_s=1e6)), (run.overview(), run.overview(start_s=1e6)),
