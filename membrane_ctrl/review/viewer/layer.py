@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
 from membrane_ctrl.model import event_words, run_status
@@ -157,8 +158,8 @@ class Layer:
             self._stream.log(path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
             found = changes(level[lane.field], np.nan)
             if found:
-                times = level["time_s"][[row for row, _ in found]]
-                states = [lane.word(code) for _, code in found]
+                times = np.append(level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0)
+                states = pa.array([*(lane.word(code) for _, code in found), None])  # the lane ends with the run
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
