@@ -13,13 +13,13 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _only_numbers_are_numbers(cls, table: Any) -> Any:
-        """Refuse `true` and "1" for a number: pydantic takes both, so a leftover switch would pass as a quantity."""
+        """Refuse `true` and "1" for a number, 1 for a switch: pydantic takes them all for what they are not."""
         for name, value in table.items() if isinstance(table, dict) else ():
             field = cls.model_fields.get(name)
-            if field is None or not _has(value, bool | str):
-                continue
-            kinds = _kinds(field.annotation)
-            if _has(value, bool) and not kinds & {bool, Any}:
+            kinds = set() if field is None else _kinds(field.annotation)
+            if kinds == {bool} and not isinstance(value, bool):
+                raise ValueError(f"{name}: {value!r}: write true or false")
+            if kinds and _has(value, bool) and not kinds & {bool, Any}:
                 raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
             if _has(value, str) and kinds & {int, float} and not kinds & {str, Any}:
                 raise ValueError(f"{name}: {value!r}: write a number, without quotes, with a decimal point")

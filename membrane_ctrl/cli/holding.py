@@ -34,7 +34,7 @@ def hold(
     twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
     devices: Annotated[
         Path | None,
-        typer.Option(help="With --twin: emulate this configuration's instruments, each with its own protocol."),
+        typer.Option(help="With --twin: emulate the [devices] of this configuration, each with its own protocol."),
     ] = None,
     duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",

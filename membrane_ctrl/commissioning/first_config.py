@@ -90,8 +90,8 @@ def _role(role: str, optional: bool) -> Table:
             continue
         table: Table = {"driver": driver}
         for name, field in drivers[driver].model_fields.items():
-            if field.is_required() and name != "driver":
-                answer = _asked(f"  {_comment(f'{driver}.{name}')} {name} =")
+            if name == "raw" or (field.is_required() and name != "driver"):  # only a preset replaces `raw`
+                answer = _asked(f"  {name} ({_comment(f'{driver}.{name}').rstrip('.')})")
                 table[name] = answer if field.annotation is str else _value(answer)
         try:
             toml_file.parse(table, drivers[driver], role)
@@ -102,7 +102,7 @@ def _role(role: str, optional: bool) -> Table:
 
 
 def _asked(question: str) -> str:
-    return str(typer.prompt(question, default="", show_default=False, prompt_suffix=" ", err=True)).strip()
+    return str(typer.prompt(question, default="", show_default=False, prompt_suffix=": ", err=True)).strip()
 
 
 def _value(answer: str) -> Any:

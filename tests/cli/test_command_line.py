@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -52,3 +53,53 @@ def test_a_file_error_that_no_command_foresaw_is_one_line(
         "membrane-ctrl: some/file: no space left on device; "
         "check that it exists, its permissions and the free disk space\n"
     )
+
+
+@pytest.mark.parametrize("words", [[], ["config"], ["ctl"], ["alarm"], ["tune"]], ids=" ".join)
+def test_a_group_without_a_command_prints_its_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(words) == Exit.BAD_INPUT
+    printed = capsys.readouterr()
+    assert "Usage: membrane-ctrl" in printed.out
+    assert printed.err == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(["holdd"], "Did you mean 'hold'?"), (["ctl", "statsu"], "Did you mean 'status'?"), (["tnue"], "'tune'")],
+    ids=str,
+)
+def test_a_misspelt_command_gets_a_suggestion(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(words) == Exit.BAD_INPUT
+    assert told in capsys.readouterr().err
+
+
+def test_help_loads_no_configuration() -> None:
+    commands = [["--help"], *([name, "--help"] for name in ("hold", "safe", "check", "config", "measure", "runs"))]
+    code = "import contextlib, io, sys\nfrom membrane_ctrl.cli import run\n"
+    code += "with contextlib.redirect_stdout(io.StringIO()):\n"
+    code += f"    assert [run(words) for words in {commands}] == {[0] * len(commands)}\n"
+    code += "assert not {'membrane_ctrl.config.schema', 'numpy', 'asyncio'} & set(sys.modules)"
+    assert loaded(code) == set()
+
+
+def test_square_brackets_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["hold", "--help"]) == 0
+    assert "[devices]" in capsys.readouterr().out
+    path = tmp_path / "[loop].toml"
+    path.write_text("[shape]\nenabled = false\n")
+    assert cli.run(["check", str(path)]) == 0
+    assert "[loop].toml" in "".join(capsys.readouterr().out.split("\n"))
+
+
+def test_a_folder_of_runs_that_cannot_be_written_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "runs").write_text("a file")
+    assert cli.run(["hold", "--twin", "--duration", "1s", "--logs", str(tmp_path / "runs")]) == Exit.DEVICE_FAILED
+    assert f"{tmp_path / 'runs'}: cannot be written" in capsys.readouterr().err
+
+
+def test_check_finds_an_absent_group(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "lab.toml").write_text("[port]\ngroup = 'nobody-has-this'\n")
+    assert cli.run(["check", str(tmp_path / "lab.toml")]) == Exit.BAD_INPUT
+    assert "no group 'nobody-has-this' on this machine; create it" in capsys.readouterr().err

@@ -91,10 +91,13 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     pump = ["bronkhorst_modbus", "/dev/x", "3", "bronkhorst_modbus", "rtu:///dev/ttyUSB1", "3"]  # no URL first
     gauge = ["bronkhorst_modbus", "rtu:///dev/ttyUSB1", "5"]
     screen = ["pygame", "1920", "1080", "0.4961"]
-    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "uvc", *screen) == 0
+    vent = ["modbus_map", "tcp://10.0.0.1:502", "0", "[0, 20000]", "[0.0, 1.0]"]
+    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen) == 0
     config = load(path, Config)
     assert config.devices is not None
-    assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure"}
+    assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure", "vent"}
+    assert config.devices.vent is not None
+    assert config.devices.vent.raw == (0.0, 20000.0)
     assert config.devices.screen is not None
     assert config.devices.screen.pixel_mm == 0.4961
     assert config.shape.enabled

@@ -111,6 +111,8 @@ def test_every_default_is_written_out() -> None:
         (b"[loop]\nkp_per_s = '0.61'\n", ["loop.kp_per_s", "without quotes"]),
         (b"[optics.camera]\nprincipal_px = ['1', 2]\n", ["optics.camera.principal_px", "without quotes"]),
         (b"[loop]\nkp_per_s = true\n", ["loop.kp_per_s", "true is neither"]),
+        (b"[shape]\nenabled = 1\n", ["shape.enabled", "write true or false"]),
+        (b"[shape]\nenabled = 'no'\n", ["shape.enabled", "write true or false"]),
         (b"[twin]\nseed = true\n", ["twin.seed", "true is neither"]),
         (b"[loop]\nkp_per_s = 1\nkp_per_s = 2\n", ["line 3", "kp_per_s = 2 comes twice"]),
         (b"[loop]\n[loop]\n", ["line 2", "[loop] comes twice"]),
