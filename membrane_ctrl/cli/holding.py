@@ -78,10 +78,10 @@ def twin(
     from_flat: FlatOption = False,
 ) -> int:
     """Serve the simulated bench over Modbus TCP, for any client, until interrupted; or `play` a scenario on it."""
-    from membrane_ctrl.sim.bench import serve_twin
-
     if context.invoked_subcommand is not None:
         return errors.Exit.DONE
+    from membrane_ctrl.sim.bench import serve_twin
+
     return serve_twin(_started(configured(config), from_flat), speed)
 
 
@@ -96,7 +96,7 @@ def play(
 ) -> int:
     """Play a scenario with its faults on the simulated bench, and record it as a run."""
     if scenario is None:
-        from membrane_ctrl.hold.scenario import list_scenarios
+        from membrane_ctrl.hold.scenarios import list_scenarios
 
         return list_scenarios()
     terminal.progress("loading the simulated bench")

@@ -9,7 +9,7 @@ from pathlib import Path
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.console import process, why
 from membrane_ctrl.controller import tick
-from membrane_ctrl.hold import scenario, start
+from membrane_ctrl.hold import scenario, scenarios, start
 from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun
@@ -26,7 +26,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
 
     Raises InputError for an unknown or invalid scenario, DeviceError if the folder cannot be written.
     """
-    path = scenario.find_scenario(word)
+    path = scenarios.find_scenario(word)
     played = scenario.load_scenario(path, scenario.Scenario)
     name = name or path.stem
     # a stranger's file decides neither where runs are stored nor which are deleted

@@ -16,7 +16,6 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import Rings, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.sim import bench_events, plant, truth_shape, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
@@ -93,33 +92,11 @@ class Scenario(Section):
 
 
 S = TypeVar("S", bound=Scenario)
-_FOLDER = Path(__file__).parent / "scenarios"
 
 
 def load_scenario(path: Path, model: type[S]) -> S:
     """Read a scenario. Raises InputError: one line that names the file, the field and what would be right."""
     return toml_file.load(path, model)
-
-
-def shipped() -> list[Path]:
-    """Files of the scenarios that come with the program; a name is the file's without its suffix."""
-    return sorted(_FOLDER.glob("*.toml"))
-
-
-def list_scenarios() -> int:
-    """Print names and titles of the scenarios that come with the program."""
-    for path in shipped():
-        print(f"{path.stem:18} {toml_file.read_toml(path)['title']}")
-    return Exit.DONE
-
-
-def find_scenario(word: str) -> Path:
-    """The file of a scenario, given its name or a path. Raises InputError."""
-    named = _FOLDER / f"{word.replace('-', '_')}.toml"
-    path = named if named in shipped() else Path(word)
-    if not path.is_file():
-        raise InputError(f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file")
-    return path
 
 
 Due = Command | Callable[[virtual_bench.VirtualBench], None]

@@ -26,7 +26,9 @@ def test_the_command_line_loads_no_heavy_library() -> None:
     assert loaded("import membrane_ctrl.cli") == set()
 
 
-@pytest.mark.parametrize("words", [["ctl", "status"], ["runs"], ["safe", "absent.toml"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [["ctl", "status"], ["runs"], ["safe", "absent.toml"], ["twin", "play"]], ids=" ".join
+)
 def test_the_quick_commands_load_what_they_need_alone(words: list[str]) -> None:
     code = "import contextlib, io\nfrom membrane_ctrl.cli import run\n"
     code += f"with contextlib.redirect_stdout(io.StringIO()):\n    run({words})"

@@ -10,7 +10,8 @@ import pytest
 from membrane_ctrl import cli
 from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.hold import play
-from membrane_ctrl.hold.scenario import Scenario, ScenarioRun, find_scenario, load_scenario, shipped
+from membrane_ctrl.hold.scenario import Scenario, ScenarioRun, load_scenario
+from membrane_ctrl.hold.scenarios import find_scenario, shipped
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.run_files.run import open_run
