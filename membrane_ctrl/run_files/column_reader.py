@@ -127,17 +127,16 @@ def _parts(
     waiting: list[pa.RecordBatch] = []
     spans: list[_Span] = []
     rows_max = cells // max(len(wanted), len(names or ()))
+    rows = size_bytes = 0  # of what waits
     error: Exception | None = None
     try:
         for batch in sealed_stream.decoded_batches(content.data, wanted):
             if batch.num_rows > _PART_CELLS // len(wanted) or any(column.null_count for column in batch.columns):
                 raise pa.ArrowInvalid("a batch that no recorder writes")
-            if waiting and (
-                sum(each.num_rows for each in waiting) + batch.num_rows > rows_max
-                or sum(each.nbytes for each in waiting) + batch.nbytes > _PART_BYTES
-            ):
+            rows, size_bytes = rows + batch.num_rows, size_bytes + batch.nbytes
+            if waiting and (rows > rows_max or size_bytes > _PART_BYTES):
                 yield pa.Table.from_batches(waiting)
-                waiting = []
+                waiting, rows, size_bytes = [], batch.num_rows, batch.nbytes
             waiting.append(batch)
             spans.append(_span(batch))
     except (pa.ArrowException, OSError, ValueError) as found:

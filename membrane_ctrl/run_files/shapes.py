@@ -223,13 +223,14 @@ def deviation_map_um(parameters_um: Column) -> Map:
 
 
 def without_terms(height: AnyArray, terms: int) -> AnyArray:
-    """A square map of the unit disc less the best fit of the first Zernike terms to its finite pixels.
+    """A square map of the unit disc less the best fit of the first terms, at most 4, to its finite pixels.
 
     3 terms are piston and tilt, 4 defocus as well.
     """
     there = np.isfinite(height)
-    x, y = _grid(len(height))
-    basis, left = zernike.values(x[there], y[there])[:terms], height.copy()
+    x, y = (axis[there] for axis in _grid(len(height)))
+    # spans the same as the Zernike terms, which take 70 ms
+    basis, left = np.stack((np.ones_like(x), x, y, x**2 + y**2))[:terms], height.copy()
     left[there] -= np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0] @ basis
     return left
 
