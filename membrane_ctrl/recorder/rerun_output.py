@@ -151,6 +151,7 @@ class RerunOutput:
     def close(self) -> None:
         """Write the footer; the last segment is then among `closed`. Raises RecordingError."""
         last = self._recording.path
+        self._errors.guarded("telemetry streams", self._telemetry.finish)
         self._recording.close()
         if last is not None:
             self.closed.append(last)

@@ -78,7 +78,7 @@ class QuietFilter:
         return quiet
 
 
-_BAND_EVERY_S = 5.0
+_OVERVIEW_EVERY_S = 5.0
 
 
 class TelemetryStreams:
@@ -90,13 +90,11 @@ class TelemetryStreams:
         self._band = streams.band(self._band_um)
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
         self._codes: dict[str, float] = {}
-        self._band_s = math.nan  # end of the band so far
-        self._rest = np.empty((0, len(telemetry.FIELDS)))  # rows of a second that is not over
+        self._rest = np.empty((0, len(telemetry.FIELDS)))  # not in the overview yet
 
     def start_segment(self) -> None:
-        """Restart lanes and band: a new file does not know the last state of the previous one."""
+        """Restart every lane: a new file does not know the last state of the previous one."""
         self._codes.clear()
-        self._band_s = math.nan
 
     def send(self, rows: telemetry.Rows) -> None:
         """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
@@ -106,20 +104,26 @@ class TelemetryStreams:
         self._send_overview(rows)
         self._send_lanes(rows)
 
-    def _send_overview(self, rows: telemetry.Rows) -> None:
-        """Send a row for each second that is over; now and then the band up to the last row."""
+    def finish(self) -> None:
+        """Send what waits for its time."""
+        if len(self._rest):
+            self._send_overview(self._rest[:0], last=True)
+
+    def _send_overview(self, rows: telemetry.Rows, last: bool = False) -> None:
+        """Send a row for each second, some seconds at a time, as a chunk costs more than a row; and the band."""
+        waiting_s = telemetry.column(self._rest, "mono_s")
+        fresh = telemetry.column(rows, "mono_s") > waiting_s.max(
+            initial=-math.inf
+        )  # not if sent again after a failure
+        self._rest = rows = np.concatenate((self._rest, rows[fresh]))
         time_s = telemetry.column(rows, "mono_s")
-        if not time_s[-1] - self._band_s < _BAND_EVERY_S:
-            edge_s = time_s[[0, -1]] if math.isnan(self._band_s) else time_s[-1:]
-            self._band_s = float(time_s[-1])
-            square = np.full((len(edge_s), 1), self._band_um**2)
-            self._recording.measurements(self._band.path, edge_s, np.zeros_like(square), square)
-        rows = np.concatenate((self._rest, rows))
-        second = np.floor(telemetry.column(rows, "mono_s"))
-        starts = np.flatnonzero(np.diff(second, prepend=-1.0))
-        *whole, self._rest = np.split(rows, starts[1:])
-        if not whole:
+        second = np.floor(time_s)
+        if second[-1] - second[0] < _OVERVIEW_EVERY_S and not last:
             return
+        whole = np.split(rows, np.flatnonzero(np.diff(second)) + 1)
+        self._rest = rows[:0] if last else whole.pop()
+        square = np.full((2, 1), self._band_um**2)
+        self._recording.measurements(self._band.path, time_s[[0, -1]], np.zeros_like(square), square)
         means = np.concatenate([streams.mean_row(part) for part in whole])
         errors_um = np.concatenate([streams.overview_um(part) for part in whole])
         true_um = telemetry.true_error_um(telemetry.columns(means))[:, np.newaxis]
