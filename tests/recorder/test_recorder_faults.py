@@ -291,7 +291,7 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
 
 
 def test_a_disk_that_runs_low_is_reported_once(tmp_path: Path) -> None:
-    config = Config(recording=RecordingConfig(min_free_mb=1e12))
+    config = Config(recording=RecordingConfig(min_free_mb=1e9))
     for bench in make_bench(tmp_path, config):
         for number in range(3):
             bench.second(number)
