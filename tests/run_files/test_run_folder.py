@@ -52,7 +52,7 @@ def test_logs_that_is_a_file_is_named_with_a_remedy(tmp_path: Path) -> None:
 
 def test_too_little_space_is_named_with_a_remedy(tmp_path: Path) -> None:
     config = Config(recording=RecordingConfig(min_free_mb=1e9))
-    with pytest.raises(DeviceError, match=r"MB free, recording.min_free_mb requires 1000000000000; delete"):
+    with pytest.raises(DeviceError, match=r"MB free, recording.min_free_mb requires 1000000000; delete"):
         run_folder.create_run_folder(tmp_path, "demo", STARTED_UTC, config)
     assert not list(tmp_path.iterdir())
 
