@@ -67,7 +67,8 @@ def hold(
         standby=standby,
         lab=devices is not None,
     )
-    return hold_mirror(options)
+    with errors.named(devices or config):
+        return hold_mirror(options)
 
 
 @twin_app.callback()
@@ -116,7 +117,8 @@ def safe(
     """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""
     from membrane_ctrl.commissioning.safe import make_safe
 
-    return make_safe(configured(config), str(config), logs, latch)
+    with errors.named(config):
+        return make_safe(configured(config), str(config), logs, latch)
 
 
 def check(config: ConfigArgument, json: JsonOption = False) -> int:
@@ -124,7 +126,8 @@ def check(config: ConfigArgument, json: JsonOption = False) -> int:
     loaded = configured(config)  # first: a mistake shows at once
     from membrane_ctrl.commissioning.check import check_config
 
-    return check_config(loaded, str(config), json)
+    with errors.named(config):
+        return check_config(loaded, str(config), json)
 
 
 def devices(json: JsonOption = False) -> int:

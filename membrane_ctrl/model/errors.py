@@ -69,3 +69,15 @@ def writing(target: Path, kind: type[CommandError] = InputError, remedy: str = "
         yield
     except OSError as error:
         raise kind(f"{target}: cannot be written ({os_reason(error)}){remedy}") from None
+
+
+@contextmanager
+def named(source: Path | None) -> Iterator[None]:
+    """Put the configuration's file before an error of the block that begins with a key, such as `devices.pump: ..`."""
+    try:
+        yield
+    except InputError as error:
+        key = str(error).partition(":")[0]
+        if source is None or key.startswith(str(source)) or "." not in key or set("/ ") & set(key):
+            raise
+        raise InputError(f"{source}: {error}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -105,3 +106,13 @@ def test_check_finds_an_absent_group(tmp_path: Path, capsys: pytest.CaptureFixtu
     (tmp_path / "lab.toml").write_text("[port]\ngroup = 'nobody-has-this'\n")
     assert cli.run(["check", str(tmp_path / "lab.toml")]) == Exit.BAD_INPUT
     assert "no group 'nobody-has-this' on this machine; create it" in capsys.readouterr().err
+
+
+def test_a_setting_that_only_its_driver_refuses_is_named_with_its_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    link = 'driver = "modbus_map"\nlink = "tcp://127.0.0.1:1"\naddress = 0\nvalue = [0.0, 1.0]\n'  # no raw
+    path = tmp_path / "lab.toml"
+    path.write_text("".join(f"[devices.{role}]\n{link}" for role in ("displacement", "gauge_pressure", "pump")))
+    assert cli.run(["safe", str(path)]) == Exit.BAD_INPUT
+    assert re.fullmatch(rf"membrane-ctrl: {path}: devices\.\w+: raw is missing.*\n", capsys.readouterr().err)
