@@ -73,7 +73,7 @@ def writing(target: Path, kind: type[CommandError] = InputError, remedy: str = "
 
 @contextmanager
 def named(source: Path | None) -> Iterator[None]:
-    """Put the configuration's file before an error of the block that begins with a key, such as `devices.pump: ..`."""
+    """Put the file before an error of the block that begins with a key of it, such as `devices.pump: ...`."""
     try:
         yield
     except InputError as error:
