@@ -52,6 +52,7 @@ def typed(*texts: str, paused: bool = False) -> tuple[Desk, list[Request]]:
         (["s", "n"], False, []),
         (["s", "\r"], False, []),
         (["sy"], False, []),  # a paste
+        (["hs", "y"], False, [{"do": "hold"}]),
         (["s", "ny"], False, []),
         (["s", "s", "y"], False, []),  # the second key has answered the question
         (["m", "door\r"], False, [{"do": "mark", "text": "door"}]),
