@@ -241,7 +241,7 @@ def test_a_run_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
-    line = run_refused(hold(tmp_path, config="[recording]\nmin_free_mb = 1e12\n")[3:], 4)
+    line = run_refused(hold(tmp_path, config="[recording]\nmin_free_mb = 1e9\n")[3:], 4)
     assert "free" in line
     assert not list(tmp_path.glob("logs/*"))
 
