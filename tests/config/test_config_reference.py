@@ -120,6 +120,7 @@ def test_the_editor_accepts_what_a_run_writes_and_a_height_map_in_a_file() -> No
         ("[lop]\n", "$"),
         ("[twin]\nscenario = 'stormy'\n", "$.twin.scenario"),
         ("[devices.pump]\nport = '/dev/x'\n", "$.devices.pump"),
+        ("[devices.displacement]\nport = '/dev/x'\nrate_khz = 2\n", "$.devices.displacement"),
         ("[devices.pump]\ndriver = 'ventus'\nport = '/dev/x'\nnode = 3\n", "$.devices.pump"),
         ("[[alarms.rules]]\nname = 'Big'\nfield = 'x'\nraise_at = 1\nclear_at = 0\n", "$.alarms.rules[0].name"),
     ],
