@@ -31,8 +31,8 @@ duration_s: str = open_run("logs/last").utc(0.0)
 
 
 def run(*words: object, cwd: Path, **environment: str) -> str:
-    """Output of a command that succeeds, in an environment that does not know the sources."""
-    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    """Output of a command that succeeds, in an environment that knows neither the sources nor their kernels."""
+    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
     done = subprocess.run(
         [str(word) for word in words], cwd=cwd, env=clean | environment, capture_output=True, text=True, check=False
     )

@@ -13,7 +13,7 @@ Vector3 = tuple[Length, Length, Length]
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
-_SQUARE = 1e-6  # of unit vectors: rounding to seven digits
+_UNIT, _SQUARE = 1.1e-5, 1e-6  # of the squared length, from rounding to five digits, and of the cosine
 
 
 class HeightMapConfig(Section):
@@ -226,4 +226,4 @@ def _or_file(schema: dict[str, Any]) -> None:
 def _orthonormal(rows: tuple[Vector3, ...]) -> bool:
     """Whether the rows are unit vectors at right angles."""
     products = [(sum(x * y for x, y in zip(a, b, strict=True)), a is b) for a in rows for b in rows]
-    return all(abs(product - same) <= _SQUARE for product, same in products)
+    return all(abs(product - same) <= (_UNIT if same else _SQUARE) for product, same in products)

@@ -145,7 +145,7 @@ def test_switched_off_and_without_room_nothing_is_written(stack: ExitStack, tmp_
     off.take("full")
     off.fault(3)
     assert off.kept() == []
-    full = Keeping(stack, tmp_path / "full", min_free_mb=1e12, raw_every_cycles=1)
+    full = Keeping(stack, tmp_path / "full", min_free_mb=1e9, raw_every_cycles=1)
     full.folder.parent.mkdir()
     full.take("full")
     assert full.kept() == []

@@ -42,7 +42,7 @@ GOOD = 'title = "x"\nduration_s = 20.0\n[config.loop]\nrate_hz = 10.0\n'
         ('[[expect.bounds]]\nfield = "trim_um"\n', ["expect.bounds.0", "low, high"]),
         ('[expect]\nexit = "well"\n', ["expect.exit", "safety_trip"]),
         ("[expect]\nfault = []\n", ["expect.fault", "did you mean faults"]),
-        ("", ["expect", "required"]),
+        ("", ["expect", "missing"]),
     ],
 )
 def test_a_bad_file_is_one_line(tmp_path: Path, text: str, words: list[str]) -> None:
