@@ -62,7 +62,7 @@ class HouseFigures:
 
 # A newcomer finds the room in a minute; a change that needs more must give its reason here. Lines: the code had
 # 49,860 lines when its rooms were in order. Capabilities added since may take 5,000 more: keys that explain
-# themselves, the catalogue, keys of the console, scenarios to play, pump curves.
+# themselves, the catalogue, keys of the console, scenarios to play, the page of `tune explore`.
 LIMITS = HouseFigures(280, 55_000, 5.0, 3, 16, 9, 1)
 
 
