@@ -11,12 +11,11 @@ import numpy as np
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.tick import pack_tick
-from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.processes.ring import RingWriter
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 Rings = dict[str, RingWriter]

@@ -20,12 +20,11 @@ import numpy as np
 from benchmarks.figures import Figure, at_least, at_most, show
 from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, StatesConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.bench_events import DailyTemperature, LaserDropout, PressureWeather
 from membrane_ctrl.sim.plant import BenchEvent, Plant
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 DAY_S = 86_400.0

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
-from membrane_ctrl.sim import plant, truth_shape, virtual_bench
+from membrane_ctrl.sim import plant, virtual_bench
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0
@@ -38,7 +38,7 @@ class TwinHold:
     def __init__(self, config: Config, events: Sequence[plant.BenchEvent] = ()) -> None:
         self.config = config
         self.bench = virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
-        source = truth_shape.TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
+        source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
         self._shapes: list[shape_estimate.ShapeEstimate] = []
 
         def shape(now_s: float) -> shape_estimate.ShapeEstimate | None:

@@ -14,9 +14,9 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.hold.virtual_run import Rings, VirtualRun, VirtualTick
+from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
-from membrane_ctrl.sim import bench_events, plant, truth_shape, virtual_bench
+from membrane_ctrl.sim import bench_events, plant, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
 _FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
@@ -114,7 +114,7 @@ class ScenarioRun:
             config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE)
         )
         self.bench = virtual_bench.VirtualBench(mirror, config.devices.watchdog_s if config.devices else 0.5)
-        shape = truth_shape.TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
+        shape = TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
         self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
         self._ends_s = scenario.duration_s
         begin, end = (0.0, Command("hold", "scenario")), (scenario.duration_s, Command("stop", "duration"))

@@ -1,14 +1,24 @@
-"""How a run opens in the viewer: one tab per question."""
+"""How a run opens in the viewer: one tab per question, and the page of its figures so far."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.recorder import summary_panel
+from membrane_ctrl.model.event_words import for_people
+from membrane_ctrl.model.run_status import RunStatus, gains_words
 from membrane_ctrl.run_files import shapes, streams
+
+SUMMARY_PATH = "/summary"
+# Each page is 0.7 kB. In the first minutes somebody is watching.
+SUMMARY_INTERVAL_S, SUMMARY_EARLY_INTERVAL_S, SUMMARY_EARLY_S = 60.0, 10.0, 300.0
+SUMMARY_AT_ONCE = frozenset({"state", "fault", "cleared", "command", "end"})
 
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
@@ -85,7 +95,7 @@ def _overview(config: Config) -> rrb.Vertical:
         _lanes(),
         row_shares=[3, 1.6, 1.6, 2.6],
     )
-    page = rrb.TextDocumentView(name="Summary", origin=summary_panel.PATH)
+    page = rrb.TextDocumentView(name="Summary", origin=SUMMARY_PATH)
     return rrb.Vertical(
         rrb.Horizontal(plots, page, column_shares=[3.2, 1]), _text_log(), row_shares=[4.4, 1], name="Overview"
     )
@@ -226,3 +236,61 @@ VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejec
 
 TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, RUNG, FAULT)
 LANES: tuple[Lane, ...] = (*TELEMETRY_LANES, VERDICT)
+
+
+def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) -> str:
+    """The figures of the run so far as a page of the recording.
+
+    Parameters
+    ----------
+    summary : mapping
+        The content of `summary.json` so far, or when read back: with None for NaN.
+    status : RunStatus
+        What follows from the events so far.
+    config : Config
+        Of the run.
+    """
+    held, states = summary["held"], summary["states"]
+    faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
+    rows = {
+        "held": _span(held["held_s"]),
+        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(held["std_um"]),
+        "mean error": _um(held["mean_um"], "+"),
+        f"1 s means within ±{config.limits.band_um:g} µm": _share(held["in_band"]),
+        "faults": str(summary["fault_count"] or "none"),
+        "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
+        "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
+        "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
+        "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
+        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected" if summary["cycles"] else "",
+        "geometry": _geometry(summary["geometry"]),
+        "gains": gains_words(status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]),
+        "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
+        "not recorded": status.recording_words,
+    }
+    state = states[-1]["state"] if states else "not started"
+    lines = [f"| {name} | {_cell(words)} |" for name, words in rows.items() if words]
+    return "\n".join((f"| {state} | {_cell(status.why)} |", "|---|---|", *lines)) + "\n"
+
+
+def _geometry(geometry: Mapping[str, Any]) -> str:
+    words = [str(geometry[key]) for key in ("hash", "file") if geometry.get(key)]
+    calibrated = geometry.get("calibrated_utc")
+    return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
+
+
+def _um(value: float | None, sign: str = "", unit: str = "µm") -> str:
+    return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
+
+
+def _share(value: float | None) -> str:
+    return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
+
+
+def _span(seconds: float) -> str:
+    """As `0:09:12`."""
+    return str(timedelta(seconds=round(seconds)))
+
+
+def _cell(words: str) -> str:
+    return for_people(words).replace("|", "/")

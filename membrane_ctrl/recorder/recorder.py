@@ -13,7 +13,7 @@ from membrane_ctrl.model import files, object_codec, plain_json, run_events, run
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
-from membrane_ctrl.recorder import housekeeping, rerun_output, sink, summary_panel
+from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
 from membrane_ctrl.run_files import events, run_folder, tables
 from membrane_ctrl.run_files.summary import Summary
 
@@ -213,7 +213,7 @@ class Recorder:
         guarded("state file", self._hand_on)
 
     def _summary_page(self) -> str:
-        return summary_panel.markdown(self._summary.as_dict(self._dropped(), {}), self._status, self._config)
+        return blueprint.summary_page(self._summary.as_dict(self._dropped(), {}), self._status, self._config)
 
     def _see_folder(self, now_s: float) -> None:
         """Continue in a new folder if the run's was removed: writing to a deleted file raises no error."""

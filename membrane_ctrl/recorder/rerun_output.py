@@ -8,7 +8,7 @@ from typing import Protocol
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.recorder import rerun_streams, sink, summary_panel
+from membrane_ctrl.recorder import blueprint, rerun_streams, sink
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 
 # A full disk is retried this often, so that recording continues soon after a person makes room.
@@ -99,11 +99,13 @@ class RerunOutput:
             self._thumbnails.send(now_s)
 
     def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
-        if now_s < self._next_summary_s and not any(event.get("kind") in summary_panel.AT_ONCE for event in events):
+        if now_s < self._next_summary_s and not any(
+            event.get("kind") in blueprint.SUMMARY_AT_ONCE for event in events
+        ):
             return
-        early = now_s < summary_panel.EARLY_S
-        self._next_summary_s = now_s + (summary_panel.EARLY_INTERVAL_S if early else summary_panel.INTERVAL_S)
-        self._recording.page(summary_panel.PATH, now_s, self._summary())
+        early = now_s < blueprint.SUMMARY_EARLY_S
+        self._next_summary_s = now_s + (blueprint.SUMMARY_EARLY_INTERVAL_S if early else blueprint.SUMMARY_INTERVAL_S)
+        self._recording.page(blueprint.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
         if now_s < self._retry_s:

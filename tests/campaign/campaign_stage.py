@@ -14,10 +14,9 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench, _MemoryLink
 
 _WORDS = 2**16

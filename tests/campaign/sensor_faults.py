@@ -17,7 +17,7 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.safety import TABLE
-from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -27,7 +27,6 @@ from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
 from membrane_ctrl.sim.plant import BenchEvent, Plant
 from membrane_ctrl.sim.sensors import Truth
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 RATE_HZ = 10.0

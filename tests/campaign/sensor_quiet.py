@@ -10,7 +10,7 @@ from sensor_faults import Lying, LyingPlant
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
@@ -25,7 +25,6 @@ from membrane_ctrl.sim.bench_events import (
 )
 from membrane_ctrl.sim.film import Film
 from membrane_ctrl.sim.plant import BenchEvent
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _DROPOUT = "displacement_missing"  # five seconds without light are a true alarm

@@ -18,7 +18,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.hold.virtual_run import VirtualRun
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
@@ -26,7 +26,6 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unp
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.truth_shape import TruthShape
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
 

@@ -16,13 +16,12 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_tick
-from membrane_ctrl.hold.virtual_run import Alter, VirtualRun, VirtualTick
+from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files.tables import ColumnTables
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.truth_shape import ShapeSource
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.earlier_inputs import write_inputs
 from tests.support.synthetic_shape import shape_at

@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import AbsoluteTimeRange
 from rerun.blueprint.encodings import TimelineColumn
 
-from membrane_ctrl.recorder import summary_panel
+from membrane_ctrl.recorder import blueprint
 from membrane_ctrl.review.viewer.layer import prefix_of
 
 TABS = ("overview", "loop", "shape", "faults", "tuning")
@@ -101,7 +101,7 @@ class ReviewBlueprint:
     def _pages(self) -> rrb.Tabs:
         """A page of figures for each run."""
         names = [label or "Summary" for label in self.labels]
-        origins = [prefix_of(label) + summary_panel.PATH for label in self.labels]
+        origins = [prefix_of(label) + blueprint.SUMMARY_PATH for label in self.labels]
         return rrb.Tabs(
             *(rrb.TextDocumentView(name=n, origin=o) for n, o in zip(names, origins, strict=True)), active_tab=0
         )

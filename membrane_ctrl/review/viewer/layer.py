@@ -16,8 +16,8 @@ from membrane_ctrl.model import event_words, run_status
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import FIELDS, changes
-from membrane_ctrl.recorder import rerun_streams, summary_panel
-from membrane_ctrl.recorder.blueprint import TELEMETRY_LANES
+from membrane_ctrl.recorder import rerun_streams
+from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
@@ -120,7 +120,7 @@ class Layer:
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
         cycles = run.shapes()
         found = find_events(seconds, cycles, run.config.limits.band_um)
-        self._page(summary_panel.PATH, _summary_page(run))
+        self._page(SUMMARY_PATH, _summary_page(run))
         self._overviews(level, run.config.limits.band_um)
         if not self._overview_only:
             self._ticks(run, part_s)
@@ -299,7 +299,7 @@ def _summary_page(run: Run) -> str:
     for each in run.log:
         status = status.after_event(each.event, each.mono_s)
     try:
-        page = summary_panel.markdown(run.summary or {}, status, run.config)
+        page = summary_page(run.summary or {}, status, run.config)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
         page = "`summary.json` is missing, damaged or of an earlier version.\n"
     name = event_words.for_people(run.name)

@@ -8,7 +8,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import unpack
-from membrane_ctrl.recorder.summary_panel import markdown
+from membrane_ctrl.recorder.blueprint import summary_page
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.synthetic_run import rows_of, shape_of
 
@@ -16,7 +16,7 @@ FAULT = events.Fault(33, "board_fault", "a cause", "bits 0x4", "must be 0", "pum
 
 
 def page(summary: Summary, status: RunStatus) -> dict[str, str]:
-    lines = markdown(summary.as_dict({}, {}), status, Config()).splitlines()
+    lines = summary_page(summary.as_dict({}, {}), status, Config()).splitlines()
     assert lines[1] == "|---|---|"
     return dict(line.strip("| ").split(" | ") for line in (lines[0].replace("|  |", "| - |"), *lines[2:]))
 
