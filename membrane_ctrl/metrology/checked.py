@@ -158,13 +158,19 @@ def _check(
     known |= {flag.frame: flag for flag in integrity.obvious(stack, binned)}
     excluded = set(known)
     flags: list[integrity.Flag] = []
-    for _ in range(rounds):
+    for _ in range(rounds + 1):
         try:
             attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (evidence.NoFigureError, ValueError) as error:
             raise RejectedSetError(str(error), _merged(_believable(stack, flags), known)) from None
-        flags = integrity.inspect(stack, binned, attempt.scene, excluded)
+        readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
+        seen = evidence.gather(stack, binned, attempt.scene, readable)
+        flags = integrity.inspect(stack, seen, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
+        uneven = evidence.uneven_light(stack, seen, set(seen) - excluded) if stack.light is None else None
+        if not fresh and uneven is not None:
+            stack = replace(stack, light=uneven)  # a round with the light that each frame had
+            continue
         if not fresh:
             _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
             shape = attempt.view.mask.shape

@@ -114,7 +114,7 @@ def _axis_phases(
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
     slope = np.zeros(index.size) if sensitivity is None else sensitivity
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
-    return pixel_phases(frames, stack.shifts_rad(used), combined, index, slope, reference, 2**optics.camera.bits - 1)
+    return pixel_phases(frames, stack.design(used), combined, index, slope, reference, 2**optics.camera.bits - 1)
 
 
 def reconstruct_full(
@@ -223,4 +223,4 @@ def _combination(checked: Checked, axis: int, moved: bool) -> phasor.StepCombina
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)
     motion_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um if moved else None
-    return motion.combine_steps(phase.step_weights(shifts), shifts, 1, motion_um)
+    return motion.combine_steps(checked.stack.weights(used), shifts, 1, motion_um)

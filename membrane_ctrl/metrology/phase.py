@@ -1,8 +1,10 @@
 """Wrapped phase and modulation from N phase steps, equal or not (the paper's eq. 1 for N = 4).
 
 Each frame is I_k = A + B cos(phi + d_k) = A + C cos d_k - S sin d_k with C = B cos phi and S = B sin phi: linear
-in (A, C, S). Least squares over the frames is one fixed 3 x N matrix for all pixels. For equal steps it is
-C = 2/N sum I cos d, S = -2/N sum I sin d, and for N = 4 S : C = (I4 - I2) : (I1 - I3), the paper's formula.
+in (A, C, S). Where the light of the frames is known to differ, frame k is l_k A + b_k B cos(phi + d_k), with its
+level l_k and its swing b_k about 1. Least squares over the frames is one fixed 3 x N matrix for all pixels. For equal
+steps it is C = 2/N sum I cos d, S = -2/N sum I sin d, and for N = 4 S : C = (I4 - I2) : (I1 - I3), the paper's
+formula.
 
 The phasor C + iS is linear in the intensities: sums over pixels may be taken before the arctangent, which weighs
 each pixel by its modulation and never meets a phase jump.
@@ -19,18 +21,27 @@ from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, ComplexArray, FloatArray, IntArray
 
 
-def step_weights(shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
-    """Rows (3, N) that turn the N intensities of a pixel into A, C and S: pseudo-inverse of [1, cos d, -sin d].
+def step_design(shifts_rad: Sequence[float] | FloatArray, light: FloatArray | None = None) -> FloatArray:
+    """Rows (N, 3) that turn A, C and S of a pixel into its intensities: [l, b cos d, -b sin d].
+
+    `light` (2, N) has the level l and the swing b of each frame; 1 by default.
+    """
+    shifts = np.asarray(shifts_rad, float)
+    level, swing = np.ones((2, shifts.size)) if light is None else light
+    return np.stack([level, swing * np.cos(shifts), -swing * np.sin(shifts)], axis=1)
+
+
+def step_weights(shifts_rad: Sequence[float] | FloatArray, light: FloatArray | None = None) -> FloatArray:
+    """Rows (3, N) that turn the N intensities of a pixel into A, C and S: pseudo-inverse of `step_design`.
 
     The phase steps (N,) may have any order and spacing. Raises ValueError if they do not determine a phase (fewer
     than three different ones on the circle).
     """
-    shifts = np.asarray(shifts_rad, float)
-    design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
+    design = step_design(shifts_rad, light)
     # a condition number beyond this multiplies the noise of the phase a hundredfold
-    if len(shifts) < 3 or np.linalg.cond(design) > 100:
-        raise ValueError(f"phase steps {np.round(shifts, 3).tolist()} rad do not determine a phase")
-    return np.linalg.pinv(design)
+    if len(design) < 3 or np.linalg.cond(design) > 100:
+        raise ValueError(f"phase steps {np.round(shifts_rad, 3).tolist()} rad do not determine a phase")
+    return np.asarray(np.linalg.pinv(design), np.float64)
 
 
 def equal_shifts(steps: int) -> FloatArray:
@@ -51,9 +62,7 @@ def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Comp
 def step_residual(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> FloatArray:
     """Residual of each frame after the model A + B cos(phi + d_k), (N, ...): zero but for noise if all is well."""
     stack = np.asarray(frames, float)
-    shifts = np.asarray(shifts_rad, float)
-    design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
-    projector = np.eye(len(shifts)) - design @ step_weights(shifts)
+    projector = np.eye(len(stack)) - step_design(shifts_rad) @ step_weights(shifts_rad)
     return np.asarray(np.tensordot(projector, stack, axes=1))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.optics.compiled import kernel, split
-from membrane_ctrl.metrology.phase import AXES, step_weights
+from membrane_ctrl.metrology.phase import AXES, step_design, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
@@ -23,6 +23,8 @@ class FrameStack:
     patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
     displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
     unusable: dict[int, str]  # frames that hold no picture
+    # (2, frames): level and swing of the light of each sinusoid about 1, where the frames' light is known to differ
+    light: FloatArray | None = None
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
@@ -40,9 +42,17 @@ class FrameStack:
         """Phase steps of sinusoids."""
         return np.array([self.patterns[k].shift_rad for k in frames])
 
+    def design(self, frames: list[int]) -> FloatArray:
+        """`phase.step_design` of sinusoids (N, 3)."""
+        return step_design(self.shifts_rad(frames), None if self.light is None else self.light[:, frames])
+
+    def weights(self, frames: list[int]) -> FloatArray:
+        """`phase.step_weights` of sinusoids (3, N). Raises ValueError if they do not determine a phase."""
+        return step_weights(self.shifts_rad(frames), None if self.light is None else self.light[:, frames])
+
     def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
-        return replace(self, frames=self.frames[order])
+        return replace(self, frames=self.frames[order], light=None)
 
     @property
     def readings_um(self) -> FloatArray:
@@ -106,7 +116,7 @@ class PixelPhases:
 
 
 @kernel
-def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
+def _phases(frames, index, weights, design, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
     """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced by the phase."""
     steps = weights.shape[1]
     for p in range(start, stop):
@@ -123,7 +133,7 @@ def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, r
             s += weights[2, k] * value
         rest = 0.0
         for k in range(steps):
-            left = float(frames[k, place]) - mean - c * shift_cos[k] + s * shift_sin[k]
+            left = float(frames[k, place]) - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
         # z - i q (turn z - mirror conj z): corrects the film's motion between the frames (see `motion`)
         q = slope[p]
@@ -139,7 +149,7 @@ def _phases(frames, index, weights, shift_cos, shift_sin, turn, mirror, slope, r
 
 def pixel_phases(
     frames: Image,
-    shifts_rad: FloatArray,
+    design: FloatArray,
     combined: StepCombination,
     index: IntArray,
     sensitivity_rad_per_um: FloatArray,
@@ -152,8 +162,8 @@ def pixel_phases(
     ----------
     frames : (N, height, width) array
         The axis' usable sinusoids.
-    shifts_rad : (N,) array
-        Their steps.
+    design : (N, 3) array
+        Their steps and light (`phase.step_design`).
     combined : StepCombination
         Motion of the film between them (`motion.combine_steps` for bins of one pixel).
     index : (n,) int array
@@ -166,7 +176,7 @@ def pixel_phases(
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
     out = np.empty((2, index.size), np.float32)
-    fixed = (step_weights(shifts_rad), np.cos(shifts_rad), np.sin(shifts_rad), combined.turn, combined.mirror)
+    fixed = (np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
         _phases(flat, index, *fixed, sensitivity_rad_per_um, phase, float(full_scale_adu), out, start, stop)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.evidence import Evidence, SampledBins, gather
+from membrane_ctrl.metrology.frames.evidence import Evidence
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase import AXES
 
@@ -80,14 +80,12 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     return flags
 
 
-def inspect(stack: FrameStack, binned: Binned, scene: SampledBins, excluded: Collection[int]) -> list[Flag]:
+def inspect(stack: FrameStack, evidence: dict[int, Evidence], excluded: Collection[int]) -> list[Flag]:
     """Judge all readable frames, worst first.
 
-    `scene` is predicted from the surface fitted to the frames that are not excluded. Excluded frames are judged too,
-    but not used to judge the others.
+    The evidence compares them with the surface fitted to the frames that are not excluded. Excluded frames are judged
+    too, but not used to judge the others.
     """
-    readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
-    evidence = gather(stack, binned, scene, readable)
     trusted = {k: e for k, e in evidence.items() if k not in excluded}
     flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
     twins = identical_frames(stack)
