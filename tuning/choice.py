@@ -10,7 +10,7 @@ from membrane_ctrl.controller.cross_check import require_sound
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions.folder import SessionFolder, open_session
-from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.live_hold import HoldLink, Progress
 from tuning import gains_file, session
 from tuning.proposal import design, trade
 from tuning.rig import HoldRig
@@ -48,6 +48,26 @@ def chosen(folder: SessionFolder, rig: HoldRig, yes: bool, name: str, progress: 
             progress.say(str(error))
     rig.catch_up()
     return True
+
+
+def for_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
+    """The session, if it can go on with this hold, perhaps a later one than it began on.
+
+    Raises InputError if pump, loop or gains in force are not those that its data are for.
+    """
+    where = f"the hold {link.name}"
+    _require_same_bench(where, link.config, folder)
+    known = [folder.head.before]
+    if folder.done("design"):  # its own gains may be on trial
+        known.append(gains_file.load_gains(folder.file("gains.toml")).loop)
+    running = link.config.loop
+    for key in GAIN_KEYS:
+        if all(getattr(running, key) != getattr(loop, key) for loop in known):
+            raise InputError(
+                f"{where}: loop.{key} = {getattr(running, key):g}, {folder.path.name} began with "
+                f"{getattr(known[0], key):g}: set that with `ctl gains`, or start a new session with another --name"
+            )
+    return folder
 
 
 # Kept gains into the configuration, so that the next hold starts with them.
@@ -106,7 +126,7 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
     return done.after
 
 
-def _require_same_bench(path: Path, config: schema.Config, folder: SessionFolder) -> None:
+def _require_same_bench(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
     """Raises InputError if the gains are for another pump, another loop, or the simulated bench."""
     tuned = folder.config
     if config.devices is not None and (tuned.devices is None or folder.head.source == "twin"):

@@ -24,7 +24,7 @@ ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin
 RunOption = Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")]
 SocketOption = Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")]
 LogsOption = Annotated[Path, typer.Option("--logs", help="Keep sessions in LOGS/tuning.")]
-SessionOption = Annotated[Path | None, typer.Option("--session", help="Continue this session.")]
+SessionOption = Annotated[Path | None, typer.Option("--session", "--resume", help="Resume this session.")]
 NameOption = Annotated[str, typer.Option("--name", help="Name of a new session.")]
 AuthorOption = Annotated[str | None, typer.Option("--author", help="Who is tuning; your login by default.")]
 ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, for the gains file and the journal.")]
@@ -35,6 +35,7 @@ ObserveOption = Annotated[str, typer.Option(help="Duration of the quiet hold, 5m
 VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Apply the proposal without asking.")]
 ChooseOption = Annotated[str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")]
+PageOption = Annotated[bool, typer.Option("--page", help="With `run`: serve a live page on localhost.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
 
@@ -74,6 +75,7 @@ def _step(name: str) -> None:
         yes: YesOption = False,
         choose: ChooseOption = "",
         json: JsonOption = False,
+        page: PageOption = False,
     ) -> int:
         from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
@@ -95,6 +97,7 @@ def _step(name: str) -> None:
             yes=yes,
             choose=choose,
             json=json,
+            page=page,
         )
         return _run(name, options)
 
@@ -165,11 +168,11 @@ def explore(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on localhost; a free one by default.")] = 0,
     author: AuthorOption = None,
 ) -> int:
-    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather."""
-    from tuning.command import author_name
+    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a session live."""
+    from tuning.command import NEEDS_BOKEH, author_name
 
     try:
         from tuning.explore.page import explore
     except ModuleNotFoundError:
-        raise errors.InputError("tune explore needs Bokeh: pip install 'membrane-ctrl[web]'") from None
+        raise errors.InputError(NEEDS_BOKEH.format("tune explore")) from None
     return explore(folder, logs, port, author or author_name())

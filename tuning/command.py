@@ -16,12 +16,14 @@ from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedEr
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
+from membrane_ctrl.sessions.live_log import LiveLog
 from tuning import choice, gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
 from tuning.rig import HoldRig
 
 _TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
+NEEDS_BOKEH = "{} needs Bokeh: pip install 'membrane-ctrl[web]'"
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 
@@ -44,6 +46,7 @@ class TuneOptions:
     yes: bool
     choose: str
     json: bool
+    page: bool = False
 
     @property
     def stages(self) -> tuple[tuple[float, float], ...]:
@@ -63,8 +66,21 @@ def run_session(options: TuneOptions) -> int:
     """Run all steps that are not done yet and return the exit code; raises like `one_step`."""
     choice.require_an_answer(options.yes, options.choose, known=options.session is None)
     with _session(options) as (folder, rig, progress):
+        if options.page:
+            progress.say(f"live page: {_served(folder, options)}session")
         _do_all([step for step in STEPS if not folder.done(step)], folder, rig, options, progress)
+        _note_verified(folder, options.logs, options.reason)  # if the session was killed before it did
+        report.write_report(folder)
     return _concluded(folder, options)
+
+
+def _served(folder: SessionFolder, options: TuneOptions) -> str:
+    """The address of the session's page, which lasts as long as this program."""
+    try:
+        from tuning.explore.page import serve_beside
+    except ModuleNotFoundError:
+        raise InputError(NEEDS_BOKEH.format("tune run --page")) from None
+    return serve_beside(folder, options.logs, options.author)
 
 
 def one_step(step: str, options: TuneOptions) -> int:
@@ -210,12 +226,21 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
 
 
 def _verify(folder: SessionFolder, rig: HoldRig, options: TuneOptions, told: Callable[[Stage], None]) -> None:
-    done = session.verify_step(folder, rig, told, options.stages)
+    session.verify_step(folder, rig, told, options.stages)
+    _note_verified(folder, options.logs, options.reason, again=True)
+
+
+def _note_verified(folder: SessionFolder, logs: Path, why: str, again: bool = False) -> None:
+    """Note the verification in the journal, unless it is there; `again` if it was repeated."""
+    name = folder.path.name
+    if not folder.done("verify"):
+        return
+    if not again and any(line.session == name for line in gains_file.entries(logs)):
+        return
+    done = session.verified_of(folder)
     what: gains_file.What = "kept" if done.kept else "taken_back"
-    reason = options.reason if done.kept else done.reason
-    author = folder.head.author
-    told_of = (folder.path.name, author, reason, done.before, done.after, session.traded(folder))
-    gains_file.note(options.logs, gains_file.entry(what, *told_of))
+    told_of = (name, folder.head.author, why if done.kept else done.reason, done.before, done.after)
+    gains_file.note(logs, gains_file.entry(what, *told_of, session.traded(folder)))
 
 
 def _in_a_line(step: str, folder: SessionFolder) -> str:
@@ -279,12 +304,18 @@ def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[Sessio
     with _link(options) as link:
         folder = _folder(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
+        progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.say)
+        rig.seen = progress.log.tick
         with progress.catching():
             try:
+                rig.end_experiment()  # of a session that was killed
                 with writing(folder.path, DeviceError):
                     yield folder, rig, progress
+                progress.note("ended", "done")
             except BaseException as error:
                 _go_back(rig, folder.head.before, progress)
+                progress.note("ended", str(error) or "interrupted")
+                progress.say(f"resume it with `membrane-ctrl tune run --resume {folder.path}`")
                 if isinstance(error, HoldError):
                     raise DeviceError(str(error)) from None
                 raise
@@ -312,15 +343,17 @@ def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
 
 def _folder(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
     """Return the named session, else the newest, or a new one if there is a hold to start it on."""
-    if options.session is not None:
-        return open_session(options.session)
     if link is None:
-        return newest_session(options.logs)
+        return newest_session(options.logs) if options.session is None else open_session(options.session)
+    if options.session is not None:
+        return choice.for_hold(open_session(options.session), link)
+    begun: SessionFolder | None = None
     if not fresh:
         with contextlib.suppress(InputError):
-            newest = newest_session(options.logs)
-            if (newest.head.source, newest.head.name) == (link.name, options.name) and not newest.done("verify"):
-                return newest
+            begun = newest_session(options.logs)
+    of = None if begun is None else (begun.head.source, begun.head.name)
+    if begun is not None and of == (link.name, options.name) and not begun.done("verify"):
+        return choice.for_hold(begun, link)
     return create_session(options.logs, options.name, options.author, link.name, link.config, link.config.loop)
 
 

@@ -15,7 +15,7 @@ from scipy.signal import welch
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import AnyArray
-from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.model.files import move, users, write_text_atomic
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
 from tuning import gains_file, session
 from tuning.identification import disturbance, identify, loop_model, records
@@ -275,9 +275,10 @@ def _image(folder: SessionFolder, name: str) -> str:
 def write_recording(folder: SessionFolder) -> None:
     """Write `session.rrd` with the steps done so far."""
     stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
-    path = folder.file("session.rrd")
-    path.unlink(missing_ok=True)
-    stream.save(path, default_blueprint=_blueprint())
+    path = users(folder.file("session.rrd"))
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    stream.save(part, default_blueprint=_blueprint())
     if folder.done("characterise"):
         _experiments(stream, folder)
     if folder.done("observe"):
@@ -293,6 +294,7 @@ def write_recording(folder: SessionFolder) -> None:
         _record(stream, "after", records.load_record(folder.file("verify.npz")))
     stream.flush()
     stream.disconnect()
+    move(part, path)
 
 
 def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:

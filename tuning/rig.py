@@ -124,6 +124,7 @@ class HoldRig:
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
         self._link, self._who, self._progress = link, who, progress
+        self.seen: Callable[[telemetry.TelemetryRow], None] = lambda row: None  # each recorded tick
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
         self.loop = link.config.loop  # with the gains last set
@@ -186,11 +187,21 @@ class HoldRig:
 
     def go_back(self, loop: LoopConfig) -> None:
         """End any running experiment and set the last good gains."""
-        self._take()
-        if self._rows and self._rows[-1].state == states.State.TUNE:
-            self._link.ask(Command("hold", self._who, "tuning session interrupted"))
+        self.end_experiment()
         if loop != self.loop:
             self.set_gains(loop, "back to the last good gains")
+
+    def end_experiment(self) -> None:
+        """End the experiment that runs, perhaps that of a session that was killed, and discard its ticks."""
+        self._take()
+        if not self._rows or self._rows[-1].state != states.State.TUNE:
+            return
+        self._link.ask(Command("hold", self._who, "tuning session interrupted"))
+        while not self._rows or self._rows[-1].state == states.State.TUNE:
+            self._rows.clear()
+            self._take()
+        while self._rows[0].state == states.State.TUNE:
+            self._rows.popleft()
 
     def catch_up(self) -> None:
         """Discard the ticks so far: while a person thinks, nothing is recorded."""
@@ -224,6 +235,7 @@ class HoldRig:
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)
+        self.seen(row)
         return self._rows.popleft()
 
     def _take(self) -> None:

@@ -20,6 +20,7 @@ from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, t
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.run_files import events
+from membrane_ctrl.sessions.live_log import LiveLog
 
 
 class HoldError(Exception):
@@ -161,6 +162,7 @@ class Progress:
     """Counts the recorded seconds of a session; raises a requested KeyboardInterrupt at a safe place."""
 
     def __init__(self) -> None:
+        self.log: LiveLog | None = None  # of the session, once it is known
         self._live = sys.stderr.isatty()
         self._step, self._planned_s, self._after_s = "", 0.0, 0.0
         self._done_s = self._shown_s = 0.0
@@ -171,7 +173,8 @@ class Progress:
         """Start a step with its planned duration, and that of the later steps."""
         self._step, self._planned_s, self._after_s = step, planned_s, after_s
         self._done_s = self._shown_s = 0.0
-        self.say(f"{step}" + (f": about {_clock(planned_s)}" if planned_s else ""))
+        self._print(f"{step}" + (f": about {_clock(planned_s)}" if planned_s else ""))
+        self.note("step", step, planned_s=planned_s, after_s=after_s)
 
     def __call__(self, seconds: float) -> None:
         """Note additional recorded seconds."""
@@ -186,15 +189,25 @@ class Progress:
         line = (
             f"{self._step}: {_clock(self._done_s)}, {_clock(left_s)} left, session {_clock(left_s + self._after_s)}"
         )
-        terminal.live_line(line) if self._live else self.say(line)
+        terminal.live_line(line) if self._live else self._print(line)
 
     def say(self, line: str) -> None:
-        """Print a permanent line."""
+        """Print a permanent line, and note it in the log."""
+        self._print(line)
+        self.note("said", line)
+
+    def note(self, what: str, line: str, **more: float) -> None:
+        """Note in the log, if there is one."""
+        if self.log is not None:
+            self.log.note(what, line, **more)
+
+    def _print(self, line: str) -> None:
         terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
 
     def ask(self, question: str) -> str:
         """Ask on the terminal; the answer is empty at the end of the input. Ctrl-C interrupts at once."""
         print(f"{question} ", end="", file=sys.stderr, flush=True)
+        self.note("asks", question)
         self._asking = True
         try:
             return sys.stdin.readline().strip()

@@ -195,6 +195,8 @@ async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
             await tab.click("Save as gains.toml")
             await tab.until("Bokeh.documents[0].get_model_by_name('said').text.includes('Saved')")
             await tab.screenshot(tmp_path / "page.png")
+            await tab.call("Page.navigate", url=f"{url}session")
+            await tab.until("Bokeh.documents[0].get_model_by_name('now').text.includes('Nothing recorded yet')")
         assert (tmp_path / "page.png").stat().st_size > 30_000
         assert gains_file.load_gains(opened.file("gains.toml")).loop.ti_s == pytest.approx(shown["ti_s"], rel=1e-3)
         await _is_refused(url)

@@ -8,7 +8,9 @@ import os
 import shutil
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
 from membrane_ctrl.model.errors import Exit, InputError, RejectedError
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sessions.folder import STEPS, SessionFolder, open_session
+from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, open_session
 from tuning import command as tune
 from tuning import gains_file as journal
 from tuning import session
@@ -50,15 +52,106 @@ def tune_twin(logs: Path, *words: str, config: str = CONFIG) -> int:
     return command_line(["tune", *words, "--twin", "--config", str(path), "--logs", str(logs)])
 
 
+class Killed:
+    """What a kill leaves of a session after each change of its folder; hard links cost nothing."""
+
+    def __init__(self, logs: Path, into: Path) -> None:
+        self._logs, self._into = logs, into
+        self.folders: list[Path] = []
+
+    def after(self, change: Callable[..., None]) -> Callable[..., None]:
+        """The change, after which the folder is kept as it then is."""
+
+        def changed(*given: Any, **named: Any) -> None:
+            change(*given, **named)
+            for source in (self._logs / "tuning").glob("*-first"):
+                self.folders.append(self._into / str(len(self.folders)))
+                self.folders[-1].mkdir()
+                for path in source.iterdir():
+                    if path.suffix != ".jsonl":  # which grows
+                        os.link(path, self.folders[-1] / path.name)
+
+        return changed
+
+
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Logs with one complete session in them."""
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
+    """One complete session, and what it would have left if killed."""
     folder = tmp_path_factory.mktemp("logs")
-    assert (
-        tune_twin(folder, "run", "--name", "first", "--author", "eve", "--reason", "new film", "--yes", *TIMES)
-        == Exit.DONE
+    found = Killed(folder, tmp_path_factory.mktemp("killed"))
+    words = ("--name", "first", "--author", "eve", "--reason", "new film", "--yes")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "replace", found.after(os.replace))
+        patched.setattr(os, "unlink", found.after(os.unlink))
+        assert tune_twin(folder, "run", *words, *TIMES) == Exit.DONE
+    return found
+
+
+@pytest.fixture(scope="module")
+def logs(killed: Killed) -> Path:
+    """Logs with one complete session in them."""
+    return killed._logs
+
+
+LOADED: dict[str, Callable[[SessionFolder], object]] = {
+    "characterise": session.experiments_of,
+    "identify": session.found_of,
+    "observe": session.disturbance_of,
+    "design": session.offered,
+    "preview": session.preview_of,
+    "apply": session.checked_gains,
+    "verify": session.verified_of,
+}
+
+
+def test_a_session_killed_at_any_moment_has_whole_steps_only(killed: Killed) -> None:
+    reached = set()
+    for path in killed.folders:
+        if not (path / "session.json").exists():
+            continue
+        opened = open_session(path)
+        steps = [step for step in STEPS if opened.done(step)]
+        assert steps == list(STEPS[: len(steps)])
+        if steps and steps[-1] not in reached:  # the earlier a step counts as done, the less of it may be there
+            LOADED[steps[-1]](opened)
+            reached.add(steps[-1])
+    assert reached == set(STEPS)
+
+
+def test_a_session_killed_before_its_journal_is_complete_when_resumed(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copied = Path(shutil.copytree(logs, tmp_path / "logs"))
+    (path,) = (copied / "tuning").glob("*-first")
+    (copied / "tuning" / "journal.jsonl").unlink()
+    (path / "session.rrd").unlink()
+    before = {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")}
+    assert tune_twin(copied, "run", "--resume", str(path), "--yes") == Exit.DONE
+    tune._note_verified(open_session(path), copied, "once more")
+    assert [(line.what, line.session) for line in journal.entries(copied)] == [("kept", path.name)]
+    assert {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")} == before
+    assert (path / "session.rrd").exists()
+    assert "characterise" not in capsys.readouterr().err
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("step", STEPS)
+def test_a_session_killed_in_any_step_goes_on_with_it(killed: Killed, tmp_path: Path, step: str) -> None:
+    """The steps before it are not repeated, and the end is the same."""
+    at = next(
+        path
+        for path in reversed(killed.folders)
+        if (path / "session.json").exists() and not open_session(path).done(step)
     )
-    return folder
+    path = Path(shutil.copytree(at, tmp_path / "tuning" / "20260101T000000Z-first"))
+    kept = {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")}
+    assert tune_twin(tmp_path, "run", "--resume", str(path), "--yes", *TIMES) == Exit.DONE
+    opened = open_session(path)
+    assert all(opened.done(each) for each in STEPS)
+    assert session.verified_of(opened).kept
+    assert [line.what for line in journal.entries(tmp_path)] == ["kept"]
+    done = [name for each in STEPS[: STEPS.index(step)] for name in FILES[each] if name in kept]
+    assert all((path / name).stat().st_mtime_ns == kept[name] for name in done)
 
 
 @pytest.fixture

@@ -1,8 +1,11 @@
 """The page of `tune explore`: sliders, curves and a table, served by Bokeh on localhost."""
 
+import asyncio
 import html
 import json
 import math
+import queue
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +16,10 @@ from bokeh.models import widgets
 from bokeh.server.server import Server
 
 from membrane_ctrl.model import errors
+from membrane_ctrl.sessions import folder
 from tuning import gains_file, session
 from tuning.explore.curves import DAMPINGS, DELAYS, STEP_UM, Curves, Sliders, Workpiece, curves, of_path, shown_s
+from tuning.explore.live_page import LivePage
 from tuning.identification import loop_model
 from tuning.proposal import candidates, design
 
@@ -263,15 +268,57 @@ def explore(path: Path, logs: Path, port: int, author: str) -> int:
 
     Raises InputError for a folder that is neither, DeviceError if the port is taken.
     """
-    of = of_path(path, logs)
-
-    def attach(page: document.Document) -> None:
-        Page(of, saver(of, author)).attach(page)
-
-    try:  # Bokeh refuses web sockets of any origin but localhost and this port: no other site moves the sliders
-        server = Server({"/": attach}, address=_HOST, port=port)
-    except OSError as error:
-        raise errors.DeviceError(f"port {port}: {errors.os_reason(error)}; choose another with --port") from None
+    server = _server(path, logs, port, author)
     print(f"exploring on http://localhost:{server.port}/ until Ctrl-C", flush=True)
     server.run_until_shutdown()
     return 0
+
+
+def serve_beside(opened: folder.SessionFolder, logs: Path, author: str) -> str:
+    """Serve the page of a session from a thread of the program that runs it; returns its address.
+
+    Raises DeviceError if there is no port.
+    """
+    begun: queue.Queue[Server | Exception] = queue.Queue()
+
+    def serve() -> None:
+        async def forever() -> None:
+            begun.put(_server(opened.path, logs, 0, author))
+            await asyncio.Event().wait()
+
+        try:
+            asyncio.run(forever())
+        except Exception as error:
+            begun.put(error)
+
+    threading.Thread(target=serve, daemon=True, name="page").start()
+    server = begun.get()
+    if isinstance(server, Exception):
+        raise server
+    return f"http://localhost:{server.port}/"
+
+
+def _server(path: Path, logs: Path, port: int, author: str) -> Server:
+    """A server, started: at `/` gains to explore, or the session until there are any; at `/session` the session."""
+    opened = folder.open_session(path) if (path / "session.json").exists() else None
+    of = of_path(path, logs) if opened is None else None
+
+    def live(page: document.Document) -> None:
+        assert opened is not None
+        LivePage(opened).attach(page)
+
+    def gains(page: document.Document) -> None:
+        try:
+            found = of or of_path(path, logs)
+        except errors.InputError:  # a session that has not observed its weather yet
+            live(page)
+            return
+        Page(found, saver(found, author)).attach(page)
+
+    apps = {"/": gains} if opened is None else {"/": gains, "/session": live}
+    try:  # Bokeh refuses web sockets of any origin but localhost and this port: no other site moves the sliders
+        server = Server(apps, address=_HOST, port=port)
+    except OSError as error:
+        raise errors.DeviceError(f"port {port}: {errors.os_reason(error)}; choose another with --port") from None
+    server.start()
+    return server

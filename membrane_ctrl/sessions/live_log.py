@@ -1,0 +1,152 @@
+"""`live.jsonl` of a session: what it does, what it has found, and the centre as it moves, for the page that shows it.
+
+One JSON object per line, appended as things happen, so that nothing is lost if the session is killed. A reader may
+follow the file while it grows; a torn or foreign line is skipped.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.model import errors, files, plain_json, telemetry
+from membrane_ctrl.sessions import folder
+
+NAME = "live.jsonl"
+EVERY_S = 0.2  # one point of the picture; a relay's half cycle takes seconds
+_POINTS = 5  # of a line
+_COLUMNS = ("displacement_um", "setpoint_um", "flow_um_per_s")
+_BYTES_MAX = 8_000_000  # a session of an hour takes half a megabyte
+_POINTS_MAX = 100_000
+_LINES_MAX, _LINE_MAX = 200, 500  # what a page can show
+
+
+class LiveLog:
+    """Appends to a session's log. A disk that is full ends the log, not the session.
+
+    `told` receives the reason if it can no longer be written.
+    """
+
+    def __init__(self, session: Path, rate_hz: float, told: Callable[[str], None]) -> None:
+        self._path, self._told = files.users(session / NAME), told
+        self._ticks_a_point = max(1, round(EVERY_S * rate_hz))
+        self._every_s = self._ticks_a_point / rate_hz
+        self._rows: list[telemetry.TelemetryRow] = []
+        self._good = True
+        self._end = "\n"  # of a line torn when an earlier part of the session was killed
+
+    def tick(self, row: telemetry.TelemetryRow) -> None:
+        """Take a tick; every second's means are written."""
+        self._rows.append(row)
+        if len(self._rows) == _POINTS * self._ticks_a_point:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the means of the ticks so far."""
+        rows, self._rows = self._rows, []
+        groups = [rows[at : at + self._ticks_a_point] for at in range(0, len(rows), self._ticks_a_point)]
+        if groups:
+            points = {name: [_mean([getattr(row, name) for row in group]) for group in groups] for name in _COLUMNS}
+            self._append({"every_s": self._every_s, **points})
+
+    def note(self, what: str, line: str, **more: float) -> None:
+        """Note what happens: `step` (its name, `planned_s`, `after_s`), `said`, `asks`, or `ended` (why)."""
+        self.flush()
+        self._append({what: line, "utc": folder.now_utc(), **more})
+
+    def _append(self, entry: dict[str, Any]) -> None:
+        if not self._good:
+            return
+        try:
+            files.append_text(self._path, self._end + json.dumps(entry, allow_nan=False) + "\n")
+            self._end = ""
+        except OSError as error:
+            self._good = False
+            self._told(f"{self._path}: {errors.os_reason(error)}; the page does not show the rest of this session")
+
+
+def _mean(values: list[float]) -> float | None:
+    good = [value for value in values if math.isfinite(value)]
+    return round(sum(good) / len(good), 4) if good else None
+
+
+@dataclass(frozen=True, slots=True)
+class Progressed:
+    """What the log says so far."""
+
+    step: str = ""  # the one that runs, or ran last
+    planned_s: float = 0.0  # of the step
+    after_s: float = 0.0  # planned for the later steps
+    done_s: float = 0.0  # recorded in the step
+    asks: str = ""  # a question that waits for its answer
+    ended: str = ""  # why the session ended; empty while it runs, or if it was killed
+    said: tuple[str, ...] = ()  # results, oldest first
+    begun_s: tuple[tuple[float, str], ...] = ()  # where on the picture each step began
+
+
+@dataclass(slots=True)
+class LiveReader:
+    """Follows a log: `read` takes what is new.
+
+    Attributes
+    ----------
+    progress : Progressed
+        The state after the last `read`.
+    time_s : float
+        Seconds of hold that the picture shows.
+    """
+
+    session: Path
+    progress: Progressed = field(default_factory=Progressed)
+    time_s: float = 0.0
+    _offset: int = 0
+
+    def read(self) -> dict[str, list[float]]:
+        """New points: `time_s` and the columns, NaN for missing values. Nothing if there is no log."""
+        points: dict[str, list[float]] = {name: [] for name in ("time_s", *_COLUMNS)}
+        try:
+            data = files.read_bytes(files.users(self.session / NAME), _BYTES_MAX)
+        except OSError:
+            return points
+        whole = data.rfind(b"\n") + 1
+        for line in data[self._offset : whole].splitlines():
+            try:
+                self._take(plain_json.loads(line.decode("utf-8")), points)
+            except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
+                continue
+        self._offset = max(self._offset, whole)
+        return points
+
+    def _take(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+        if "every_s" in entry:
+            self._draw(entry, points)
+            return
+        now = self.progress
+        if "step" in entry:
+            planned_s, after_s = float(entry["planned_s"]), float(entry["after_s"])
+            begun = (*now.begun_s, (self.time_s, _line(entry["step"])))[-_LINES_MAX:]
+            self.progress = Progressed(begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun)
+        elif "said" in entry:
+            self.progress = replace(now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="")
+        elif "asks" in entry:
+            self.progress = replace(now, asks=_line(entry["asks"]))
+        else:
+            self.progress = replace(now, ended=_line(entry["ended"]), asks="")
+
+    def _draw(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+        every_s = float(entry["every_s"])
+        columns = {name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS}
+        count = len(columns[_COLUMNS[0]])
+        if not 0 < every_s <= 60 or {len(column) for column in columns.values()} != {count} or count > _POINTS_MAX:
+            raise ValueError("not a row of points")
+        for name, column in columns.items():
+            points[name] += column
+        points["time_s"] += [self.time_s + (place + 1) * every_s for place in range(count)]
+        self.time_s += count * every_s
+        self.progress = replace(self.progress, done_s=self.progress.done_s + count * every_s)
+
+
+def _line(text: object) -> str:
+    return str(text)[:_LINE_MAX]

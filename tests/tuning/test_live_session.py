@@ -1,0 +1,152 @@
+"""A session that is watched while it runs, killed, and resumed."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.model import telemetry
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions.live_log import NAME, LiveLog, LiveReader, Progressed
+from tuning import choice
+from tuning.explore.live_page import LivePage, status
+
+RATE_HZ = 50.0
+
+
+def row(tick: int, displacement_um: float) -> telemetry.TelemetryRow:
+    values = dict.fromkeys(telemetry.FIELDS, math.nan)
+    values |= {"tick": float(tick), "displacement_um": displacement_um, "setpoint_um": 1.0, "flow_um_per_s": 1.2}
+    return telemetry.TelemetryRow(**values)
+
+
+def logged(path: Path) -> LiveLog:
+    return LiveLog(path, RATE_HZ, lambda line: pytest.fail(line))
+
+
+def held(log: LiveLog, seconds: float, displacement_um: float = 0.5) -> None:
+    for tick in range(round(seconds * RATE_HZ)):
+        log.tick(row(tick, displacement_um))
+
+
+def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
+    log, reader = logged(tmp_path), LiveReader(tmp_path)
+    assert reader.read()["time_s"] == []
+    log.note("step", "observe", planned_s=300.0, after_s=320.0)
+    held(log, 2.0)
+    first = reader.read()
+    assert first["time_s"] == pytest.approx([0.2 * n for n in range(1, 11)])
+    assert first["displacement_um"] == pytest.approx([0.5] * 10)
+    assert first["flow_um_per_s"] == pytest.approx([1.2] * 10)
+    assert (reader.progress.step, reader.progress.planned_s, reader.progress.done_s) == ("observe", 300.0, 2.0)
+    held(log, 1.0, math.nan)
+    log.note("said", "observe: laser noise 1.00 um")
+    log.note("step", "design", planned_s=0.0, after_s=320.0)
+    log.note("asks", "apply which?")
+    more = reader.read()
+    assert more["time_s"][0] == pytest.approx(2.2)
+    assert all(math.isnan(value) for value in more["displacement_um"])
+    assert reader.progress == Progressed(
+        "design", 0.0, 320.0, 0.0, "apply which?", "", ("observe: laser noise 1.00 um",),
+        ((0.0, "observe"), (3.0, "design")),
+    )  # fmt: skip
+    assert reader.read()["time_s"] == []
+
+
+def test_a_line_torn_by_a_kill_costs_no_other_line(tmp_path: Path) -> None:
+    log = logged(tmp_path)
+    log.note("step", "observe", planned_s=300.0, after_s=0.0)
+    path = tmp_path / NAME
+    path.write_bytes(path.read_bytes() + b'{"said": "hal')
+    again = logged(tmp_path)
+    again.note("step", "verify", planned_s=600.0, after_s=0.0)
+    reader = LiveReader(tmp_path)
+    reader.read()
+    assert reader.progress.step == "verify"
+    assert [step for _, step in reader.progress.begun_s] == ["observe", "verify"]
+
+
+def test_a_foreign_log_harms_nobody(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_bytes(
+        b'[]\n5\n{"every_s": 1e400, "displacement_um": [], "setpoint_um": [], "flow_um_per_s": []}\n\xff\xfe\n'
+        b'{"every_s": 0.2, "displacement_um": [1], "setpoint_um": [1, 2], "flow_um_per_s": [1]}\n'
+        b'{"step": {}, "planned_s": "x", "after_s": 1}\n{"said": "' + b"a" * 9000 + b'"}\n'
+    )
+    reader = LiveReader(tmp_path)
+    assert reader.read()["time_s"] == []
+    assert [len(line) for line in reader.progress.said] == [500]
+
+
+def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
+    said: list[str] = []
+    (tmp_path / NAME).mkdir()
+    log = LiveLog(tmp_path, RATE_HZ, said.append)
+    log.note("said", "one")
+    log.note("said", "two")
+    assert len(said) == 1
+    assert NAME in said[0]
+
+
+@pytest.mark.parametrize(
+    ("progress", "done", "silent_s", "words"),
+    [
+        (Progressed(), 0, 0.0, "Nothing recorded yet"),
+        (Progressed("observe", 300.0, 320.0, 60.0), 2, 1.0, "Now: observe, 1:00 of about 5:00; 9:20 of holding left"),
+        (Progressed("design"), 3, 40.0, "Now: design"),
+        (Progressed("design", asks="which?"), 5, 4000.0, "Waiting for an answer on its terminal: which?"),
+        (
+            Progressed("verify", 600.0),
+            6,
+            100.0,
+            "killed or hangs; resume it with: membrane-ctrl tune run --resume",
+        ),
+        (Progressed("verify", ended="interrupted"), 6, 0.0, "Ended after verify (interrupted); resume it with"),
+        (Progressed("verify", ended="done"), 7, 0.0, "Done."),
+    ],
+)
+def test_the_page_says_what_a_session_does(progress: Progressed, done: int, silent_s: float, words: str) -> None:
+    assert words in status(progress, set(folder.STEPS[:done]), silent_s, Path("logs/tuning/s"))
+
+
+def test_the_page_s_text_is_text(tmp_path: Path) -> None:
+    opened = folder.create_session(tmp_path, "s", "eve", "twin", Config(), LoopConfig())
+    log = logged(opened.path)
+    log.note("step", "characterise", planned_s=10.0, after_s=0.0)
+    held(log, 2.0)
+    log.note("said", "<script>alert(1)</script>")
+    page = LivePage(opened)
+    assert "&lt;script&gt;" in page._said.text
+    assert len(page._points.data["minutes"]) == 10
+    assert "class=now>&#9654; characterise" in page._steps.text
+
+
+RUNNING = LoopConfig(kp_per_s=0.5, setpoint_um=7.0)
+
+
+@pytest.mark.parametrize(
+    ("running", "pump", "refused"),
+    [
+        (RUNNING, {}, ""),
+        (RUNNING.model_copy(update={"setpoint_um": 0.0, "bleed_fraction": 0.01}), {}, ""),
+        (RUNNING.model_copy(update={"kp_per_s": 0.61}), {}, "loop.kp_per_s = 0.61, .* began with 0.5"),
+        (RUNNING, {"flow_full_um_per_s": 8.0}, "pump.flow_full_um_per_s = 8.0, the session had 5.3"),
+        (RUNNING.model_copy(update={"rate_hz": 25.0}), {}, "loop.rate_hz = 25.0"),
+    ],
+)
+def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
+    tmp_path: Path, running: LoopConfig, pump: dict[str, float], refused: str
+) -> None:
+    opened = folder.create_session(tmp_path, "s", "eve", "an-earlier-run", Config(loop=RUNNING), RUNNING)
+    config = Config(loop=running)
+    config = config.model_copy(update={"pump": config.pump.model_copy(update=pump)})
+    link = SimpleNamespace(config=config, name="a-later-run")
+    if not refused:
+        assert choice.for_hold(opened, link) is opened  # type: ignore[arg-type]
+        return
+    with pytest.raises(InputError, match=refused):
+        choice.for_hold(opened, link)  # type: ignore[arg-type]
