@@ -79,7 +79,7 @@ class RoleBench:
                 self._commanded = 0.0
         for role, device in self._devices.by_role().items():
             try:
-                self.identities[role] = await _answer(role, device.open())
+                self.identities[role] = await answer(role, device.open())
             except roles.LinkError as error:
                 await self.close()
                 raise type(error)(f"{role}: {error}") from error
@@ -136,9 +136,9 @@ class RoleBench:
         await self._require_watchdog()
         pump = 0.0 if self._tripped else command.pump_fraction
         self._commanded = max(self._commanded, pump)  # the pump may have it before it answers
-        actions = [_answer("pump", self._devices.pump.set_pump(pump))]
+        actions = [answer("pump", self._devices.pump.set_pump(pump))]
         if self._devices.vent is not None:
-            actions.append(_answer("vent", self._devices.vent.set_vent(command.vent_fraction)))
+            actions.append(answer("vent", self._devices.vent.set_vent(command.vent_fraction)))
         _raise_first(await asyncio.gather(*actions, return_exceptions=True))
         self._commanded = pump
         self._fed_s = self._clock()
@@ -158,7 +158,8 @@ class RoleBench:
         await self._stop_reopening()
         await self._stop_watchdog()
         for device in reversed(self._devices.by_role().values()):
-            await device.close()
+            with contextlib.suppress(Exception):  # one driver's mistake must not leave the next device open
+                await device.close()
 
     async def _sensors(self) -> tuple[roles.DisplacementSample, float, float, float]:
         devices = self._devices
@@ -173,8 +174,8 @@ class RoleBench:
         """Read-back of pump and vent; NaN for a vent that the bench does not have."""
         vent = self._devices.vent
         if vent is None:
-            return await _answer("pump", self._devices.pump.pump_fraction()), math.nan
-        asked = (_answer("pump", self._devices.pump.pump_fraction()), _answer("vent", vent.vent_fraction()))
+            return await answer("pump", self._devices.pump.pump_fraction()), math.nan
+        asked = (answer("pump", self._devices.pump.pump_fraction()), answer("vent", vent.vent_fraction()))
         found = await asyncio.gather(*asked, return_exceptions=True)
         _raise_first(found)
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
@@ -186,7 +187,7 @@ class RoleBench:
         self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
         if "displacement" not in self._tasks:
             try:
-                self._last_sample = await _answer("displacement", self._devices.displacement.displacement())
+                self._last_sample = await answer("displacement", self._devices.displacement.displacement())
             except roles.LinkError as error:
                 self._failed("displacement", error)
         return self._last_sample
@@ -195,7 +196,7 @@ class RoleBench:
         if read is None or role in self._tasks:
             return math.nan
         try:
-            return await _answer(role, read())
+            return await answer(role, read())
         except roles.LinkError as error:
             self._failed(role, error)
             return math.nan
@@ -209,7 +210,7 @@ class RoleBench:
         device = self._devices.by_role()[role]
         while True:
             with contextlib.suppress(roles.LinkError):
-                if await _answer(role, device.open()) == self.identities[role]:
+                if await answer(role, device.open()) == self.identities[role]:
                     break
             await asyncio.sleep(_RETRY_S)
         del self._tasks[role]
@@ -259,8 +260,11 @@ def _ending(task: asyncio.Task[None]) -> str:
     return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"
 
 
-async def _answer(role: str, asked: Awaitable[T]) -> T:
-    """A device's answer; an unexpected exception is a fault of that device, not the end of the run."""
+async def answer(role: str, asked: Awaitable[T]) -> T:
+    """A device's answer; an unexpected exception is a fault of that device, not the end of the run.
+
+    Raises LinkError.
+    """
     try:
         return await asked
     except roles.LinkError:

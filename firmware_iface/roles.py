@@ -217,6 +217,17 @@ class Vent(Device, Protocol):
         """The commanded (or actual) value reported by the device. Raises LinkError."""
 
 
+# What the device of a role is asked for in every tick, and in which unit it answers
+READS = {
+    "displacement": ("displacement", "um"),
+    "gauge_pressure": ("gauge_pressure_pa", "Pa"),
+    "barometer": ("ambient_pressure_pa", "Pa"),
+    "thermometer": ("air_temperature_c", "degC"),
+    "pump": ("pump_fraction", "of full scale"),
+    "vent": ("vent_fraction", "of full scale"),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Pattern:
     """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black"."""

@@ -191,11 +191,34 @@ class ModbusMapConfig(Section):
         return self
 
 
+class ExternalConfig(Section):
+    """An instrument whose driver is a package of its own (docs/new-device.md). The driver defines more keys.
+
+    Reading a configuration never loads that package: only opening or emulating the devices does.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    driver: Literal["external"]
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    """Name under which the driver is installed. Set it to one that `devices` lists."""
+    port: Port
+    timeout_s: Timeout = 0.2
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """The keys of the table that its driver defines."""
+        return self.model_dump(exclude={"driver", "name"})
+
+
 Driver = Field(discriminator="driver")
-DisplacementDriver = Annotated[Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig, Driver]
-PumpDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | VentusConfig | ModbusMapConfig, Driver]
-PressureDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | ModbusMapConfig, Driver]
-BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig, Driver]
+DisplacementDriver = Annotated[Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig | ExternalConfig, Driver]
+PumpDriver = Annotated[
+    BronkhorstModbusConfig | BronkhorstProparConfig | VentusConfig | ModbusMapConfig | ExternalConfig, Driver
+]
+PressureDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | ModbusMapConfig | ExternalConfig, Driver]
+BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig | ExternalConfig, Driver]
+ValueDriver = Annotated[ModbusMapConfig | ExternalConfig, Driver]
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
 

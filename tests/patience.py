@@ -29,13 +29,13 @@ def slow_machine(board: str = "tcp://127.0.0.1:1") -> str:
 
 
 @contextmanager
-def patient_check() -> Iterator[None]:
-    """`check` waits that long."""
+def patient_check(answer_s: float = ANSWER_S) -> Iterator[None]:
+    """`check` waits that long; drivers of other packages check their time-outs, which are at most 5 s."""
     probes = check._probes
 
     async def patient(devices: DevicesConfig) -> list[DeviceProbe]:
-        waits = {role: table.model_copy(update={"timeout_s": ANSWER_S}) for role, table in devices.roles().items()}
-        return await probes(devices.model_copy(update={"timeout_s": ANSWER_S, **waits}))
+        waits = {role: table.model_copy(update={"timeout_s": answer_s}) for role, table in devices.roles().items()}
+        return await probes(devices.model_copy(update={"timeout_s": answer_s, **waits}))
 
     with patch("membrane_ctrl.commissioning.check._probes", patient):
         yield

@@ -279,8 +279,8 @@ class LineDriver:
 
     @property
     def _shown(self) -> str:
-        """The settings in words."""
-        raise NotImplementedError
+        """The settings in words; a driver may add its own."""
+        return ""
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""

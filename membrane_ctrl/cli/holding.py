@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
 
 twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
+devices_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
 
 FlatOption = Annotated[
@@ -22,8 +23,9 @@ FlatOption = Annotated[
 
 def add_commands(app: typer.Typer) -> None:
     """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`."""
-    for command in (hold, safe, check, devices, conformance):
+    for command in (hold, safe, check, conformance):
         app.command()(command)
+    app.add_typer(devices_app, name="devices")
     app.add_typer(twin_app, name="twin")
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
@@ -130,11 +132,26 @@ def check(config: ConfigArgument, json: JsonOption = False) -> int:
         return check_config(loaded, str(config), json)
 
 
-def devices(json: JsonOption = False) -> int:
-    """List serial ports, cameras and displays, with the text to paste into a configuration."""
+@devices_app.callback()
+def devices(context: typer.Context, json: JsonOption = False) -> int:
+    """List serial ports, cameras, displays and installed drivers, with the text to paste into a configuration."""
+    if context.invoked_subcommand is not None:
+        return errors.Exit.DONE
     from membrane_ctrl.commissioning.devices import list_devices
 
     return list_devices(json)
+
+
+@devices_app.command()
+def new(
+    name: Annotated[str, typer.Argument(help="Name of the driver, such as acme_gauge: small letters, digits, _.")],
+    role: Annotated[str, typer.Option(help="Role that the instrument fills.")] = "gauge_pressure",
+    to: Annotated[Path, typer.Option(help="Folder in which NAME-driver is made.")] = Path(),
+) -> int:
+    """Write a driver for an instrument of your own, with its emulator and tests, as a package to install."""
+    from membrane_ctrl.commissioning.new_device import write_package
+
+    return write_package(name, role, to)
 
 
 def conformance(

@@ -204,18 +204,10 @@ def _board_problem(reading: roles.BenchReading) -> str:
 
 async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
     """Open, read and close each device in turn; a failure does not stop the others."""
-    reads: dict[str, tuple[Callable[[Any], Callable[[], Awaitable[Any]]], str]] = {
-        "displacement": (lambda device: device.displacement, "um"),
-        "gauge_pressure": (lambda device: device.gauge_pressure_pa, "Pa"),
-        "barometer": (lambda device: device.ambient_pressure_pa, "Pa"),
-        "thermometer": (lambda device: device.air_temperature_c, "degC"),
-        "pump": (lambda device: device.pump_fraction, "of full scale"),
-        "vent": (lambda device: device.vent_fraction, "of full scale"),
-    }
     probes = []
     for role, device in devices.by_role().items():
-        read, unit = reads[role]
-        probes.append(await _probe(role, device, read(device), unit))
+        read, unit = roles.READS[role]
+        probes.append(await _probe(role, device, getattr(device, read), unit))
         if probes[-1].problem:
             await asyncio.sleep(_BACK_OFF_S)
     return probes
@@ -225,12 +217,13 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
     try:
-        found = await device.open()
-        value, p50_ms, p99_ms = await _timed(read)
+        found = await role_bench.answer(role, device.open())
+        value, p50_ms, p99_ms = await _timed(lambda: role_bench.answer(role, read()))
     except roles.LinkError as error:
         return DeviceProbe(role, name, problem=str(error), notes=notes)
     finally:
-        await device.close()
+        with contextlib.suppress(Exception):
+            await device.close()
     identity = " ".join(part for part in (found.kind, found.serial, found.firmware, found.detail) if part)
     problem = ""
     if isinstance(value, roles.DisplacementSample):

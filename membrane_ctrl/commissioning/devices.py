@@ -1,4 +1,4 @@
-"""`devices`: the hardware on this machine, with the text to paste into a configuration."""
+"""`devices`: the hardware and drivers on this machine, with the text to paste into a configuration."""
 
 import asyncio
 import json
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from firmware_iface import conformance, roles
+from firmware_iface import conformance, drivers, roles
 from firmware_iface.links import aravis
 from firmware_iface.links.serial_port import serial_ports
 from membrane_ctrl.instruments.bench import locked, modbus_names
@@ -18,9 +18,9 @@ _DRM = Path("/sys/class/drm")
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A port, camera or display."""
+    """A port, camera or display, or a driver that another package provides."""
 
-    kind: str  # "port", "camera" or "display"
+    kind: str  # "port", "camera", "display" or "driver"
     name: str  # its own description
     paste: str = ""  # configuration line that names it; may be empty
 
@@ -28,7 +28,7 @@ class FoundDevice:
 def list_devices(as_json: bool) -> int:
     """Print every device found, and the searches that failed."""
     cameras, missing = find_cameras()
-    found = [*find_ports(), *cameras, *find_displays()]
+    found = [*find_ports(), *cameras, *find_displays(), *find_drivers()]
     if as_json:
         listed = [asdict(device) for device in found]
         print(json.dumps({"schema": "membrane-devices/1", "devices": listed, "notes": missing}))
@@ -76,6 +76,18 @@ def find_displays(root: Path = _DRM) -> list[FoundDevice]:
         paste = f"width_px = {width}\nheight_px = {height}" if width.isdigit() and height.isdigit() else ""
         found.append(FoundDevice("display", f"{connector}, {size}", paste))
     return found
+
+
+def find_drivers() -> list[FoundDevice]:
+    """Drivers that other packages provide (docs/new-device.md); none of them is loaded."""
+    return [
+        FoundDevice(
+            "driver",
+            f"{entry.name}, of {entry.dist.name} {entry.dist.version}" if entry.dist else entry.name,
+            f'driver = "external"\nname = "{entry.name}"',
+        )
+        for entry in drivers.installed()
+    ]
 
 
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:

@@ -24,9 +24,9 @@ class DevicesConfig(settings.Section):
     displacement: settings.DisplacementDriver | None = None
     pump: settings.PumpDriver | None = None
     gauge_pressure: settings.PressureDriver | None = None
-    vent: settings.ModbusMapConfig | None = None
+    vent: settings.ValueDriver | None = None
     barometer: settings.BarometerDriver | None = None
-    thermometer: settings.ModbusMapConfig | None = None
+    thermometer: settings.ValueDriver | None = None
     camera: settings.CameraConfig | None = None
     screen: settings.PygameScreenConfig | None = None
 

@@ -16,6 +16,8 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
+from firmware_iface import drivers
+from firmware_iface.roles import READS
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import hint, sections
 from membrane_ctrl.model.errors import InputError
@@ -68,11 +70,11 @@ class _TomlSchema(GenerateJsonSchema):
 
 
 @cache
-def json_schema() -> dict[str, Any]:
-    """The JSON schema of a configuration file, each key with its text. Treat it as constant."""
-    schema = Config.model_json_schema(schema_generator=_TomlSchema)
-    texts, chosen = _texts(), set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
-    for name, table in schema["$defs"].items():
+def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
+    """The JSON schema of a configuration file, or of a table's class, with texts. Treat it as constant."""
+    schema = root.model_json_schema(schema_generator=_TomlSchema)
+    texts, chosen = _texts(root), set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
+    for name, table in [*schema.get("$defs", {}).items(), (root.__name__, schema)]:
         for key, field in table["properties"].items():
             if text := texts.get((name, key)):
                 field["description"] = text
@@ -116,7 +118,7 @@ def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
     driver = table["properties"].get("driver", {}).get("const", "")
     places = tuple(dict.fromkeys(place for place, _ in found))
     many = any(isinstance(default, list) for _, default in found)
-    return TableHelp(places, driver, many, " ".join(table["description"].split()), tuple(keys))
+    return TableHelp(places, driver, many, " ".join(table.get("description", "").split()), tuple(keys))
 
 
 def explained(word: str) -> tuple[TableHelp, ...]:
@@ -132,11 +134,24 @@ def explained(word: str) -> tuple[TableHelp, ...]:
         keys = table.keys if wanted in prefixes else tuple(key for key in table.keys if wanted in names[key.name])
         if keys or wanted in prefixes:
             found.append(replace(table, keys=keys))
+    found = found or _of_other_packages(wanted)
     if not found:
         inside = sorted({name for name in known if wanted and wanted in name}, key=len)[:3]
         near = f"did you mean {' or '.join(inside)}?" if inside else hint(wanted, known, "see `config reference`")
         raise InputError(f"{word}: no such key or table; {near}")
     return tuple(found)
+
+
+def _of_other_packages(word: str) -> list[TableHelp]:
+    """Return the table of an installed driver of this name, whose package is loaded. Raises InputError."""
+    if all(entry.name != word for entry in drivers.installed()):
+        return []
+    try:
+        driver = drivers.load(word)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    places = [(f"devices.{role}", None) for role, (read, _) in READS.items() if hasattr(driver, read)]
+    return [replace(_table(json_schema(driver.Settings), places), driver="external")]
 
 
 def unit_of(name: str) -> str:
@@ -175,10 +190,10 @@ def _shown(default: Any) -> str:
     return "none" if default is None else json.dumps(default)
 
 
-def _texts() -> dict[tuple[str, str], str]:
+def _texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
     """Return the text below each key of the schema's classes, read from their sources."""
     found = {}
-    for module in filter(None, {inspect.getmodule(section) for section in _classes(Config)}):
+    for module in filter(None, {inspect.getmodule(section) for section in _classes(root)}):
         for node in ast.parse(inspect.getsource(module)).body:
             body = node.body if isinstance(node, ast.ClassDef) else []
             for key, text in pairwise(body):

@@ -64,6 +64,8 @@ def hold_mirror(options: HoldOptions) -> int:
         )
     for warning in cross_check.require_sound(options.config, options.source):
         print(warning.line(options.source), file=sys.stderr)
+    if options.config.devices is not None and (options.lab or not options.twin):
+        open_bench(options.config.devices)  # impossible settings end here, before anything is started
     require_sendable(options.config.alarms)
     geometry = geometry_in_force(options.config)
     clock = RunClock.start()

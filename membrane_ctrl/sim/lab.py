@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from firmware_iface import settings
+from firmware_iface import drivers, settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators import (
     bronkhorst,
@@ -24,7 +24,7 @@ from firmware_iface.emulators import (
 )
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.instruments.bench import map_keys
+from membrane_ctrl.instruments import bench
 
 _GATEWAY_NO_RESPONSE = 11
 _PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa suits the mirror's 600 Pa
@@ -126,6 +126,11 @@ class Lab:
                 return bronkhorst.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
                 )
+            case settings.ExternalConfig():
+                end = self._actuator(role) if role in self._outputs else self._sensor(role)
+                emulator = drivers.load(section.name, drivers.EMULATORS)
+                made: serial_device.SerialDevice = bench.external(emulator, role, section, end)
+                return made
             case _:
                 raise AssertionError(section)
 
@@ -141,7 +146,7 @@ class Lab:
             constants: dict[int, int] = {}
             raw_limits = (0, 0xFFFF)
             for role, section in members:
-                value_map, _ = make_map(map_keys(section), section.preset)
+                value_map, _ = make_map(bench.map_keys(section), section.preset)
                 if value_map.version_address is not None:
                     constants[value_map.version_address] = _VERSION
                 if value_map.identity is not None:

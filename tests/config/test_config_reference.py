@@ -73,7 +73,7 @@ def test_a_word_finds_its_keys(word: str, titles: list[str], names: list[str]) -
 
 def test_a_role_shows_each_of_its_drivers() -> None:
     found = {table.driver for table in reference.explained("devices.pump")}
-    assert found == {"bronkhorst_modbus", "bronkhorst_propar", "modbus_map", "ventus"}
+    assert found == {"bronkhorst_modbus", "bronkhorst_propar", "external", "modbus_map", "ventus"}
     assert {table.driver for table in reference.explained("devices.pump.serial")} == {
         "bronkhorst_modbus", "bronkhorst_propar",
     }  # fmt: skip
