@@ -1,4 +1,4 @@
-"""Writes the files generated from the register map: `docs/registers.md` and `membrane_board.h`.
+"""Writes the files generated from the register map: `docs/registers.md`, `membrane_board.h` and the board's table.
 
 Run `python -m firmware_iface.generate` after changing the map; with `--check` it writes nothing and exits with 1
 if a file is out of date.
@@ -12,6 +12,7 @@ from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterM
 
 _HERE = Path(__file__).resolve().parent
 HEADER_PATH = _HERE / "membrane_board.h"
+TABLE_PATH = _HERE / "board" / "core" / "register_table.h"
 DOCS_PATH = _HERE.parent / "docs" / "registers.md"
 _SOURCE = "firmware_iface/registers.toml with python -m firmware_iface.generate"
 
@@ -85,6 +86,55 @@ def c_header(registers: RegisterMap) -> str:
     return "\n".join([*lines, "", "#endif"]) + "\n"
 
 
+def c_table(registers: RegisterMap) -> str:
+    """The map as tables in C11: the blocks, and the limits of every register that can be written."""
+    limited = [register for register in registers if register.access == "rw"]
+    return "\n".join(
+        [
+            f"/* Blocks of registers and limits of writes. Generated from {_SOURCE}; do not edit. */",
+            "#ifndef MEMBRANE_REGISTER_TABLE_H",
+            "#define MEMBRANE_REGISTER_TABLE_H",
+            "",
+            "#include <stdbool.h>",
+            "#include <stdint.h>",
+            "",
+            "struct register_block {",
+            "    uint32_t address;",
+            "    uint32_t words;",
+            "    bool writable;",
+            "};",
+            "",
+            "struct register_limits {",
+            "    uint32_t address;",
+            "    uint32_t words;",
+            "    uint32_t low;",
+            "    uint32_t high;",
+            "};",
+            "",
+            f"#define REGISTER_BLOCKS_COUNT {len(registers.blocks)}u",
+            f"#define REGISTER_LIMITS_COUNT {len(limited)}u",
+            "",
+            "static const struct register_block REGISTER_BLOCKS[REGISTER_BLOCKS_COUNT] = {",
+            *(
+                f"    {{{block.address}u, {block.count}u, {str(block.access == 'rw').lower()}}}, /* {block.name} */"
+                for block in registers.blocks
+            ),
+            "};",
+            "",
+            "static const struct register_limits REGISTER_LIMITS[REGISTER_LIMITS_COUNT] = {",
+            *(
+                f"    {{{register.address}u, {register.words}u, {register.to_raw(register.minimum):.0f}u, "
+                f"{register.to_raw(register.maximum):.0f}u}}, /* {register.name} */"
+                for register in limited
+            ),
+            "};",
+            "",
+            "#endif",
+            "",
+        ]
+    )
+
+
 def _c_register(register: Register) -> list[str]:
     lines = [_define(f"{register.name}_ADDRESS", f"{register.address}u", f"{register.type}: {register.meaning}")]
     if register.counts_per_unit != 1:
@@ -106,7 +156,8 @@ def main(arguments: list[str] | None = None) -> int:
     check = parser.parse_args(arguments).check
     registers = default_map()
     stale = False
-    for path, text in ((DOCS_PATH, markdown(registers)), (HEADER_PATH, c_header(registers))):
+    files = {DOCS_PATH: markdown(registers), HEADER_PATH: c_header(registers), TABLE_PATH: c_table(registers)}
+    for path, text in files.items():
         if path.exists() and path.read_text(encoding="utf-8") == text:
             continue
         stale = True

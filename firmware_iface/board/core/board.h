@@ -13,10 +13,15 @@
 #define BOARD_STALLED_TICKS 20u  /* a main loop that has not turned for so long is frozen */
 
 /* The answer to a write: 0, or the code of a Modbus exception. */
-enum board_answer { BOARD_DONE = 0, BOARD_ADDRESS = 2, BOARD_VALUE = 3, BOARD_BUSY = 6 };
+enum board_answer { BOARD_DONE = 0, BOARD_ADDRESS = 2, BOARD_VALUE = 3, BOARD_FAILED = 4, BOARD_BUSY = 6 };
+
+struct settings;
 
 /* Power-up: loads the settings; outputs off, watchdog off, no claim, no faults. */
 void board_start(void);
+
+/* The settings in force. */
+const struct settings *board_settings(void);
 
 /* From the timer interrupt, every millisecond: verifies the memory, samples the sensors, lets the pressure limit and the
  * watchdog act, drives the outputs, feeds the hardware watchdog. */

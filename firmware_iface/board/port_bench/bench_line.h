@@ -1,0 +1,32 @@
+/* The wire of simulated boards to a simulated film, in lines of text.
+ *
+ * To the board: "I <displacement> <gauge> <ambient> <air> <gas> <quality>\n", raw values of the channels of hal.h;
+ * -2147483648 is "no value". From the board: "O <pump> <vent>\n", counts of HAL_FULL_SCALE, at every change and every
+ * 5 ms. */
+#ifndef MEMBRANE_BENCH_LINE_H
+#define MEMBRANE_BENCH_LINE_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "hal.h"
+
+#define BENCH_STALE_US 100000u /* without a line for so long no channel has a value */
+#define BENCH_SAID_MAX 24u
+
+struct bench_line {
+    int64_t numbers[HAL_INPUT_CHANNELS];
+    uint32_t count; /* of numbers begun; above HAL_INPUT_CHANNELS: not a line of this kind */
+    bool negative;
+    bool begun; /* within a number */
+    bool right; /* nothing unknown in this line */
+};
+
+/* Takes a byte; true when it completes a valid line, whose numbers are then valid. */
+bool bench_take(struct bench_line *line, uint8_t byte);
+
+/* Writes an output line (not terminated by 0); returns its length. */
+size_t bench_say(uint32_t pump, uint32_t vent, uint8_t *text);
+
+#endif
