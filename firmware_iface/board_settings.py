@@ -1,7 +1,7 @@
 """The record of settings that a pump board keeps in its flash, made from a TOML file.
 
-`python -m firmware_iface.board_settings board.toml settings.bin` writes the record; `board/core/settings.h` describes it.
-The board runs no pump with a damaged record, so that nothing here can be half right.
+`python -m firmware_iface.board_settings board.toml settings.bin` writes the record, which `board/core/settings.h`
+describes. A board with a damaged record runs no pump.
 """
 
 import argparse
@@ -40,10 +40,10 @@ def record(table: Mapping[str, Any]) -> bytes:
     Parameters
     ----------
     table : mapping
-        As read from TOML: `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (the standard's when absent),
-        `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value], [raw, value]],
-        in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). A channel that is
-        absent arrives in counts of its register.
+        As read from TOML: `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by default the standard's),
+        `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value], [raw,
+        value]], in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). An
+        omitted channel arrives in counts of its register.
 
     Raises
     ------

@@ -27,7 +27,7 @@ const struct settings *board_settings(void);
  * watchdog act, drives the outputs, feeds the hardware watchdog. */
 void board_tick(void);
 
-/* From the main loop: answers what arrived on the UART. */
+/* From the main loop, at least every 20 ms: answers what arrived on the UART. */
 void board_poll(void);
 
 /* Tells the tick that the main loop turns. board_poll() does so; a main loop with a long turn may do so in between. */

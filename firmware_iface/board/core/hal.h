@@ -61,6 +61,9 @@ void hal_watchdog_feed(void);
 /* Resets the processor, outputs safe at once; does not return on hardware. */
 void hal_reset(void);
 
+/* From the main loop: waits for the next interrupt (WFI), at most a millisecond. May return at once. */
+void hal_wait(void);
+
 /* Keeps board_tick() from running until hal_unlock(); returns what hal_unlock() needs. Held for some microseconds. */
 uint32_t hal_lock(void);
 void hal_unlock(uint32_t before);

@@ -11,5 +11,6 @@ int main(void)
     hal_start(settings->baud, (enum hal_parity)settings->parity);
     for (;;) {
         board_poll();
+        hal_wait();
     }
 }

@@ -137,6 +137,12 @@ void virtual_pass(uint32_t time_us, bool interrupts, bool main_loop)
     }
 }
 
+void virtual_skip(uint32_t time_us)
+{
+    chip.now_us += time_us;
+    chip.fed_us += time_us;
+}
+
 void virtual_set_input(int channel, int32_t raw)
 {
     if (channel >= 0 && channel < HAL_INPUT_CHANNELS) {

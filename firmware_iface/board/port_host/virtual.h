@@ -13,6 +13,9 @@ void virtual_power_on(const uint8_t *record, size_t length);
  * The hardware watchdog runs all the time. */
 void virtual_pass(uint32_t time_us, bool interrupts, bool main_loop);
 
+/* Lets time pass in which nothing runs, not even the hardware watchdog. */
+void virtual_skip(uint32_t time_us);
+
 void virtual_set_input(int channel, int32_t raw);
 uint32_t virtual_pump(void);
 uint32_t virtual_vent(void);

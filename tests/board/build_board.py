@@ -1,0 +1,23 @@
+"""Builds the board's firmware for the tests, with the repository's own Makefile."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+FIRMWARE = Path(__file__).parents[2] / "firmware_iface" / "board"
+
+
+def built(target: str, folder: Path, *tools: str) -> Path:
+    """Build a target of the firmware's Makefile in a folder; skip the test where a tool is missing."""
+    for tool in ("make", *tools):
+        if shutil.which(tool) is None:
+            pytest.skip(f"no {tool} on this machine: `make board` installs it")
+    subprocess.run(
+        ["make", "--silent", "-C", str(FIRMWARE), f"OUT={folder}", str(folder / target)],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return folder / target
