@@ -9,14 +9,12 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
-from membrane_ctrl.sim import plant as twin_pump
 from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
 from tuning.identification.characterise import Characterised, characterise
 from tuning.identification.disturbance import observe
@@ -65,6 +63,8 @@ class Case:
                 "laser_noise_um": self.laser_noise_um,
                 "start_error_um": 0.0,
                 "leak_time_constant_s": 1e4 / self.leak,
+                "pump_delay_s": 0.075 * self.delay,
+                "pump_lag_s": 0.15 * self.delay,
             }
         )
 
@@ -73,9 +73,7 @@ class TwinBench:
     """The twin's plant in ticks; without weather sensors unless the case has them."""
 
     def __init__(self, case: Case, seed: int, events: Sequence[BenchEvent] = ()) -> None:
-        delays = {name: getattr(twin_pump, name) * case.delay for name in ("TRANSPORT_S", "LAG_S")}
-        with patch.multiple(twin_pump, **delays):
-            self.plant = Plant(case.twin(seed), PumpConfig(flow_full_um_per_s=5.3 * case.pump), events)
+        self.plant = Plant(case.twin(seed), PumpConfig(flow_full_um_per_s=5.3 * case.pump), events)
         self._sensors = case.feedforward
         self._dt_s = 1 / case.loop().rate_hz
         self.true_um: list[float] = []
@@ -102,8 +100,9 @@ def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, 
     found = done.identified
     model, sigma = found.model, found.sigma
     # the twin's flow acts from the step on in which it changes: half a step early on average
-    dead_error_s = model.dead_time_s - (twin_pump.TRANSPORT_S * case.delay - STEP_S / 2)
-    delay_error_s = dead_error_s + model.lag_s - twin_pump.LAG_S * case.delay
+    truth = case.twin(seed=1)
+    dead_error_s = model.dead_time_s - (truth.pump_delay_s - STEP_S / 2)
+    delay_error_s = dead_error_s + model.lag_s - truth.pump_lag_s
     return {
         "gain_error": model.gain / case.pump - 1,
         "gain_sigma": sigma.gain / model.gain,

@@ -24,6 +24,8 @@ class TwinHold:
         As for a run.
     events : sequence of twin events
         Events applied to the bench.
+    bench : VirtualBench, optional
+        Another bench than the configured twin.
 
     Attributes
     ----------
@@ -35,9 +37,14 @@ class TwinHold:
 
     name = "twin"
 
-    def __init__(self, config: Config, events: Sequence[plant.BenchEvent] = ()) -> None:
+    def __init__(
+        self,
+        config: Config,
+        events: Sequence[plant.BenchEvent] = (),
+        bench: virtual_bench.VirtualBench | None = None,
+    ) -> None:
         self.config = config
-        self.bench = virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
+        self.bench = bench or virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
         source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
         self._shapes: list[shape_estimate.ShapeEstimate] = []
 

@@ -1,6 +1,7 @@
 """The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`."""
 
-from typing import Annotated
+from itertools import pairwise
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -64,6 +65,44 @@ class PumpConfig(Section):
     """Command from which a pump at rest starts. Set it to 0 for a flow controller."""
     stall_fraction: Fraction = 0.15
     """Command below which a running pump stops. Set it to 0 for a flow controller."""
+    curve_fraction: Annotated[tuple[Fraction, ...], Field(max_length=100)] = ()
+    """Commands of a measured curve, which replaces the straight line; none beyond the last one is given.
+    Set it with `tune pump` for a pump that is not straight."""
+    curve_um_per_s: tuple[Annotated[float, Field(ge=0, le=100)], ...] = ()
+    """Flow of a running pump at each of these commands. Set it with `tune pump`."""
+    curve_falling_um_per_s: tuple[Annotated[float, Field(ge=0, le=100)], ...] = ()
+    """Flow when a command is reached from a larger one. Set it with `tune pump` for a pump with hysteresis."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _full_flow_of_the_curve(cls, table: Any) -> Any:
+        """The full flow of a measured curve is its last one."""
+        flows = table.get("curve_um_per_s") if isinstance(table, dict) else None
+        if isinstance(flows, list | tuple) and flows:
+            return {"flow_full_um_per_s": flows[-1], **table}
+        return table
+
+    @model_validator(mode="after")
+    def _curve_rises(self) -> "PumpConfig":
+        commands, flows, falling = self.curve_fraction, self.curve_um_per_s, self.curve_falling_um_per_s
+        if not (commands or flows or falling):
+            return self
+        if len(commands) < 2 or len(commands) != len(flows) or (falling and len(falling) != len(flows)):
+            raise ValueError(
+                f"curve_fraction has {len(commands)} commands, curve_um_per_s {len(flows)} flows"
+                + (f", curve_falling_um_per_s {len(falling)}" if falling else "")
+                + ": give a flow for each of at least two commands"
+            )
+        if any(later <= earlier for earlier, later in pairwise(commands)):
+            raise ValueError("curve_fraction must rise from each command to the next")
+        for name, branch in (("curve_um_per_s", flows), ("curve_falling_um_per_s", falling)):
+            if any(later < earlier for earlier, later in pairwise(branch)):
+                raise ValueError(f"{name} must not fall towards larger commands")
+        if any(above < below for below, above in zip(flows, falling or flows, strict=True)):
+            raise ValueError("curve_falling_um_per_s must not be below curve_um_per_s at any command")
+        if self.flow_full_um_per_s != flows[-1]:
+            raise ValueError(f"flow_full_um_per_s must be the last flow of the curve ({flows[-1]:g}), or absent")
+        return self
 
 
 class LimitsConfig(Section):

@@ -44,6 +44,15 @@ class TwinConfig(Section):
     """Drift of the laser's mount. Change it to see the shape loop work."""
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 1.0e4
     """Time in which the leak would empty the mirror to a third. Change it to your mirror's."""
+    pump_shape: Literal["configured", "quadratic", "root", "s-shaped", "saturating", "hysteretic", "pwm"] = (
+        "configured"
+    )
+    """True curve of the pump, between the dead command and the full flow of `[pump]`.
+    Change it to practise `tune pump`."""
+    pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.075
+    """Time of the gas in the tube. Change it to your bench's."""
+    pump_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.15
+    """Time constant of motor and diaphragm. Change it to your pump's."""
     barometer_noise_pa: Annotated[float, Field(ge=0, le=100)] = 0.05
     """Noise of the barometer. Change it to your barometer's."""
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002

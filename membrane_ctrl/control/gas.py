@@ -1,6 +1,8 @@
-"""The diaphragm pump: command for a flow, and the flow a command gives.
+"""The pump: command for a flow, and the flow a command gives.
 
     q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
+
+or a measured curve through any number of points, with a second branch for falling commands if the pump has hysteresis.
 
 There is no flow between rest and the least running flow: a wanted flow in that gap goes to the nearer end, so that
 the error of the gap has no fixed sign. (Always running would add gas that nothing removes, always stopping would lose
@@ -9,6 +11,10 @@ the resulting error.
 """
 
 import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Protocol
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.filters import LagRate
@@ -19,40 +25,139 @@ STALL_MARGIN = 0.005
 # A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 um.
 KICK_S = 0.1
 
+_PER_INTERVAL = 16  # chords of the cubic between two points: within 0.1 % of its rise
 
-class PumpCurve:
-    """The inverse of the pump, which remembers whether the pump runs."""
+
+class _Branch(Protocol):
+    """A rising curve and its inverse."""
+
+    highest_fraction: float
+
+    def flow(self, fraction: float) -> float:
+        """Flow in um/s for a command."""
+
+    def fraction(self, flow_um_per_s: float) -> float:
+        """Command for a flow."""
+
+
+class _StraightLine:
+    """Flow in proportion to the command beyond `dead_fraction`."""
+
+    highest_fraction = 1.0
 
     def __init__(self, pump: PumpConfig) -> None:
-        self._pump = pump
+        self._full, self._dead = pump.flow_full_um_per_s, pump.dead_fraction
+
+    def flow(self, fraction: float) -> float:
+        return max(0.0, self._full * (fraction - self._dead) / (1.0 - self._dead))
+
+    def fraction(self, flow_um_per_s: float) -> float:
+        return self._dead + (1.0 - self._dead) * flow_um_per_s / self._full
+
+
+class _Measured:
+    """A monotone cubic (PCHIP) through measured points, tabulated, so that curve and inverse agree and cost the same.
+
+    There is no flow below the first command, and none beyond the last one is known.
+    """
+
+    def __init__(self, fractions: Sequence[float], flows_um_per_s: Sequence[float]) -> None:
+        self._fractions, self._flows = _monotone_cubic(fractions, flows_um_per_s)
+        self.highest_fraction = fractions[-1]
+
+    def flow(self, fraction: float) -> float:
+        return _between(self._fractions, self._flows, fraction) if fraction >= self._fractions[0] else 0.0
+
+    def fraction(self, flow_um_per_s: float) -> float:
+        return _between(self._flows, self._fractions, flow_um_per_s)
+
+
+def _between(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
+    """Linear interpolation, clamped to the ends."""
+    right = min(max(bisect_right(xs, x), 1), len(xs) - 1)
+    low, high = xs[right - 1], xs[right]
+    share = min(max((x - low) / (high - low), 0.0), 1.0) if high > low else 0.0
+    return ys[right - 1] + share * (ys[right] - ys[right - 1])
+
+
+def _monotone_cubic(xs: Sequence[float], ys: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Points along the cubic of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984, 300): no new extrema."""
+    widths = [b - a for a, b in pairwise(xs)]
+    chords = [(b - a) / width for (a, b), width in zip(pairwise(ys), widths, strict=True)]
+    slopes = [_end_slope(widths, chords)]
+    for (before, after), (left, right) in zip(pairwise(chords), pairwise(widths), strict=True):
+        weights = (2 * right + left, right + 2 * left)
+        flat = before == 0.0 or after == 0.0
+        slopes.append(0.0 if flat else sum(weights) / (weights[0] / before + weights[1] / after))
+    slopes.append(_end_slope(widths[::-1], chords[::-1]))
+    fractions, flows = [xs[0]], [ys[0]]
+    for i, (width, chord) in enumerate(zip(widths, chords, strict=True)):
+        square = (3 * chord - 2 * slopes[i] - slopes[i + 1]) / width
+        cube = (slopes[i] + slopes[i + 1] - 2 * chord) / width**2
+        for step in range(1, _PER_INTERVAL):
+            x = width * step / _PER_INTERVAL
+            fractions.append(xs[i] + x)
+            flows.append(max(flows[-1], ys[i] + x * (slopes[i] + x * (square + x * cube))))
+        fractions.append(xs[i + 1])
+        flows.append(ys[i + 1])
+    return fractions, flows
+
+
+def _end_slope(widths: Sequence[float], chords: Sequence[float]) -> float:
+    """Three-point slope at the first point, limited so that the first interval stays monotone."""
+    if len(chords) == 1:
+        return chords[0]
+    slope = ((2 * widths[0] + widths[1]) * chords[0] - widths[0] * chords[1]) / (widths[0] + widths[1])
+    return min(max(slope, 0.0), 3 * chords[0])
+
+
+class PumpCurve:
+    """The inverse of the pump, which remembers whether the pump runs, and between two branches how much it gives.
+
+    Hysteresis is play: the flow stays while it lies between the branches at the command, and else moves along one.
+    """
+
+    def __init__(self, pump: PumpConfig) -> None:
+        self._start_fraction = pump.start_fraction
         self._least_fraction = pump.stall_fraction + STALL_MARGIN
+        self._rising: _Branch = _StraightLine(pump)
+        if pump.curve_fraction:
+            self._rising = _Measured(pump.curve_fraction, pump.curve_um_per_s)
+        self._falling = self._rising
+        if pump.curve_falling_um_per_s:
+            self._falling = _Measured(pump.curve_fraction, pump.curve_falling_um_per_s)
+        self._flow_um_per_s = 0.0
         self._kick_left_s = KICK_S
 
     @property
     def least_flow_um_per_s(self) -> float:
         """The smallest flow of a running pump."""
-        return self.flow(self._least_fraction)
+        return self._falling.flow(self._least_fraction)
 
     def stopped(self) -> None:
         """Note that something else stopped the pump: the next flow starts it."""
         self._kick_left_s = KICK_S
+        self._flow_um_per_s = 0.0
 
     def flow(self, fraction: float) -> float:
         """Flow in um/s that a running pump gives for a command."""
-        pump = self._pump
-        return max(0.0, pump.flow_full_um_per_s * (fraction - pump.dead_fraction) / (1.0 - pump.dead_fraction))
+        return min(max(self._flow_um_per_s, self._rising.flow(fraction)), self._falling.flow(fraction))
+
+    def fraction(self, flow_um_per_s: float) -> float:
+        """Command at which a running pump, from lower commands, gives a flow."""
+        return self._rising.fraction(flow_um_per_s)
 
     def command(self, flow_um_per_s: float, dt_s: float) -> float:
         """Command for a flow; a stopped pump gets a start pulse."""
         if flow_um_per_s < 0.5 * self.least_flow_um_per_s:
             self.stopped()
             return 0.0
-        pump = self._pump
-        fraction = pump.dead_fraction + (1.0 - pump.dead_fraction) * flow_um_per_s / pump.flow_full_um_per_s
-        fraction = min(max(fraction, self._least_fraction), 1.0)
+        branch = self._rising if flow_um_per_s > self._flow_um_per_s else self._falling
+        fraction = min(max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction)
         if self._kick_left_s > 0.0:
             self._kick_left_s -= dt_s
-            fraction = max(fraction, pump.start_fraction)
+            fraction = max(fraction, self._start_fraction)
+        self._flow_um_per_s = self.flow(fraction)
         return fraction
 
 

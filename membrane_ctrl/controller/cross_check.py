@@ -16,6 +16,7 @@ from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import VaisalaPtb330Config
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control import gas
 from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError
 
@@ -202,9 +203,8 @@ def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFi
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
     say.error(above, "limits.gauge_pressure_max_pa", f"the board itself vents at {own_pa:g} Pa", "lower it to that")
-    pump, limit = config.pump, board.pump_limit_fraction
-    share = cross_check_plant.flow_um_per_s(config) / pump.flow_full_um_per_s
-    needed = pump.dead_fraction + (1.0 - pump.dead_fraction) * share
+    limit = board.pump_limit_fraction
+    needed = gas.PumpCurve(config.pump).fraction(cross_check_plant.flow_um_per_s(config))
     most = f"and the board limits the pump to {limit:g}"
     remedy = "lower it, or raise the board's limit"
     say.error(needed > limit + 1e-9, "loop.flow_max_um_per_s", f"takes a command of {needed:.2f}, {most}", remedy)

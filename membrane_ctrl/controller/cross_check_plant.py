@@ -70,8 +70,9 @@ def flow_um_per_s(config: Config) -> float:
 
 def judge_pump(config: Config, say: ConfigFindings) -> None:
     pump, loop = config.pump, config.loop
-    why = f"must lie between dead_fraction ({pump.dead_fraction:g}) and start_fraction ({pump.start_fraction:g})"
-    ordered = pump.dead_fraction <= pump.stall_fraction <= pump.start_fraction
+    least = 0.0 if pump.curve_fraction else pump.dead_fraction  # of the straight line only
+    why = f"must lie between dead_fraction ({least:g}) and start_fraction ({pump.start_fraction:g})"
+    ordered = least <= pump.stall_fraction <= pump.start_fraction
     say.error(not ordered, "pump.stall_fraction", why, "measure all three")
     test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
     if pump.start_fraction >= test_fraction:

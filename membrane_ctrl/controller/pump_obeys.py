@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, StatesConfig
+from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import Slope
 
 # A flow controller's zero and a tachometer's last count are below this; no pump moves gas below 0.1
@@ -255,9 +256,7 @@ class ActuatorTest:
             vent_um_per_s = speeds["off"] - speeds["vent"]
             if vent_um_per_s < vent_least_um_per_s:
                 return f"the vent lets the mirror down by only {vent_um_per_s:.1f} um/s"
-        pump = self._pump
-        share = (PARTS[-1].pump_fraction - pump.dead_fraction) / (1.0 - pump.dead_fraction)
-        expected_um_per_s = pump.flow_full_um_per_s * share
+        expected_um_per_s = gas.PumpCurve(self._pump).flow(PARTS[-1].pump_fraction)
         rise_um_per_s = speeds["pump"] - speeds["off"]
         if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
             return f"the pump lifts the mirror by {rise_um_per_s:.1f} um/s, not by about {expected_um_per_s:.1f} um/s"

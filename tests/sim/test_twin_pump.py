@@ -7,7 +7,7 @@ import math
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.plant import LAG_S, STEP_S, TRANSPORT_S, Plant, PumpModel
+from membrane_ctrl.sim.plant import STEP_S, Plant, PumpModel
 
 FULL_ML_PER_S = 6.0
 
@@ -50,10 +50,10 @@ def test_never_takes_gas_away() -> None:
 
 def test_answers_after_transport_and_lag(pump: PumpModel) -> None:
     flows = [pump.step(1.0) for _ in range(200)]
-    dead = round(TRANSPORT_S / STEP_S)
+    dead = round(TwinConfig().pump_delay_s / STEP_S)
     assert flows[:dead] == [0.0] * dead
     assert flows[dead] > 0
-    at_one_lag = flows[dead + round(LAG_S / STEP_S) - 1]
+    at_one_lag = flows[dead + round(TwinConfig().pump_lag_s / STEP_S) - 1]
     assert at_one_lag == pytest.approx(FULL_ML_PER_S * (1 - math.exp(-1)), rel=1e-9)
 
 
@@ -108,3 +108,28 @@ def test_refuses_a_command_that_is_no_fraction(command: tuple[float, float]) -> 
     plant = Plant(TwinConfig(scenario="calm"), PumpConfig())
     with pytest.raises(ValueError, match="fractions"):
         plant.actuate(*command)
+
+
+@pytest.mark.parametrize("shape", ["quadratic", "root", "s-shaped", "saturating", "pwm"])
+def test_shapes_of_the_twins_pump(shape: str) -> None:
+    """Each has the full flow of the straight line at its end, and another one in the middle."""
+    pump = PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S, TwinConfig.model_validate({"pump_shape": shape}))
+    flows = [settle(pump, command) for command in (0.3, 0.5, 0.7, 0.9, 1.0)]
+    assert flows == sorted(flows)
+    assert flows[-1] == pytest.approx(FULL_ML_PER_S)
+    straight = FULL_ML_PER_S * 0.4 / 0.9
+    assert flows[1] == pytest.approx(straight, abs=0.01) if shape == "pwm" else abs(flows[1] - straight) > 0.05
+
+
+def test_a_hysteretic_twin_gives_more_on_the_way_down() -> None:
+    pump = PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S, TwinConfig(pump_shape="hysteretic"))
+    up = settle(pump, 0.5)
+    settle(pump, 0.9)
+    assert settle(pump, 0.5) - up == pytest.approx(0.08 * FULL_ML_PER_S / 0.9, rel=0.02)
+
+
+def test_the_twin_follows_a_measured_curve() -> None:
+    config = PumpConfig(curve_fraction=(0.2, 0.5, 1.0), curve_um_per_s=(0.0, 1.0, 4.0))
+    pump = PumpModel(config, 4.0, STEP_S)
+    assert [settle(pump, command) for command in (0.5, 1.0)] == pytest.approx([1.0, 4.0], rel=1e-3)
+    assert pump.hold(1.0) == pytest.approx(0.5, abs=1e-3)
