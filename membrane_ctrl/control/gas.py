@@ -2,7 +2,7 @@
 
     q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
 
-or a measured curve through any number of points, with a second branch for falling commands if the pump has hysteresis.
+or a measured curve through any number of points, with a second branch for falling commands if there is hysteresis.
 
 There is no flow between rest and the least running flow: a wanted flow in that gap goes to the nearer end, so that
 the error of the gap has no fixed sign. (Always running would add gas that nothing removes, always stopping would lose
