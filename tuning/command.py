@@ -19,6 +19,7 @@ from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live
 from membrane_ctrl.sessions.live_log import LiveLog
 from tuning import choice, gains_file, report, session, twin_hold
 from tuning.identification.characterise import TYPICAL_S
+from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
 from tuning.rig import HoldRig
 
@@ -114,14 +115,19 @@ def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneO
 def map_pump(options: TuneOptions) -> int:
     """Measure the pump for the later steps of the session."""
     with _session(options) as (folder, rig, progress):
-        progress.begin("pump map", 700.0, 0.0)
+        progress.begin("pump map", PUMP_TYPICAL_S, 0.0)
         found = session.map_pump(folder, rig)
+        pump = found.pump
         progress.say(
-            f"starts at {found.start_fraction:.3f}, stalls at {found.stall_fraction:.3f} (sticks by "
-            f"{found.sticks_by:.3f}), full flow {found.flow_full_um_per_s:.2f} um/s, leak {found.leak_um_per_s:.2f} "
-            f"+- {found.leak_sigma_um_per_s:.2f} um/s; [pump] for the configuration: {folder.file('pump.toml')}"
+            f"{len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
+            f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} um/s at {pump.curve_fraction[-1]:.3f}, "
+            f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; starts at "
+            f"{pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
+            f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after {found.delay_s:.2f} s "
+            f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s; [pump] for the configuration: "
+            f"{folder.file('pump.toml')}"
         )
-        if found.too_tight:
+        if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
             progress.say(_TOO_TIGHT)
     return _concluded(folder, options)
 

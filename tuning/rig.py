@@ -152,10 +152,11 @@ class HoldRig:
 
         Raises HoldError if the experiment is refused or ends in a state other than hold.
         """
-        return self.performed(spec)[:2]
+        rows, finished = self.performed(spec)
+        return self.record(rows), finished
 
-    def performed(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished, events.ExperimentEnded]:
-        """As `perform`, also returning the event at its end (with the pump map's figures)."""
+    def performed(self, spec: trial.ExperimentSpec) -> tuple[list[telemetry.TelemetryRow], machine.Finished]:
+        """As `perform`, with the ticks instead of a record."""
         self._events.clear()
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
         rows: list[telemetry.TelemetryRow] = []
@@ -166,7 +167,7 @@ class HoldRig:
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
-        return self.record(rows), machine.Finished(told.completed, told.reason), told
+        return rows, machine.Finished(told.completed, told.reason)
 
     def set_gains(self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan) -> None:
         """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows."""

@@ -4,18 +4,19 @@ Steps that move the mirror take a `HoldRig`; the others run anywhere, at any lat
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from membrane_ctrl.config import schema
 from membrane_ctrl.config import toml_file as config_file
-from membrane_ctrl.control.experiments import machine, pump_map
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.control import gas
+from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.model import errors, files, states, telemetry
 from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
-from tuning.identification import characterise, identify, loop_model, records
+from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey, records
 from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import candidates, design, prediction, trade, verify
 from tuning.rig import HoldRig
@@ -25,6 +26,7 @@ _PREVIEW_SEEDS = 3
 # Time to check the applied gains and start the verification; then they revert automatically.
 _APPLY_S = 900.0
 _SPARE_S = 120.0
+_MAP_S = 1800.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,17 +311,47 @@ def verified_of(session: folder.SessionFolder) -> Verified:
     return session.result("verify", "verified.json", Verified)
 
 
-def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_map.PumpMap:
-    """Measure the pump for the later steps. Raises RejectedError if the map is incomplete or impossible."""
-    around = rig.around(rig.hold(40.0))
-    _, finished, event = rig.performed(characterise.spec_of("pump_map", around, 1200.0))
-    if not finished.completed:
-        raise errors.RejectedError(f"pump map: {finished.reason}")
-    values = {name: math.nan if value is None else value for name, value in event.pump_map.items()}
-    found = folder.built(pump_map.PumpMap, values)
-    if not (math.isfinite(found.start_fraction) and math.isfinite(found.stall_fraction)):
-        raise errors.RejectedError("pump map: the pump never started or never stalled; check the pump and its supply")
-    mapped = found.applied_to(session.config.pump)
-    files.write_text_atomic(files.users(session.file("pump.toml")), config_file.dump(mapped))
+# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer.
+_CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0}
+_BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
+
+
+def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_survey.PumpMap:
+    """Measure the pump for the later steps. Raises RejectedError, with what to check, if it cannot hold a mirror."""
+    before = rig.loop
+    rig.set_gains(before.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
+    around = rig.around(_returned(rig))
+    holding = gas.PumpCurve(session.config.pump).fraction(around.holding_flow_um_per_s)
+    survey = pump_survey.PumpSurvey(holding, around.limit_um)
+    try:
+        while steps := survey.steps():
+            spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
+            rows, finished = rig.performed(spec)
+            survey.take(run_of(rows, rig.dt_s), finished.completed)
+            _returned(rig)
+        found = survey.result()
+    except ValueError as error:
+        raise errors.RejectedError(f"pump map: {error}") from None
+    rig.set_gains(before, "pump mapped")
+    files.write_text_atomic(files.users(session.file("pump.toml")), config_file.dump(found.pump))
     folder.write(session.file("pump_map.json"), found)
     return found
+
+
+def _returned(rig: HoldRig) -> records.Record:
+    """Hold until the mirror is back at the setpoint, or three minutes at most."""
+    for _ in range(_BACK_MOST):
+        record, setpoint_um = rig.hold_about(_BACK_S)
+        off_um = np.abs(record.filled_displacement_um() - setpoint_um).reshape(6, -1).mean(axis=1)
+        if off_um[3:].max() < _BACK_WITHIN_UM:
+            break
+    return record
+
+
+def run_of(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_curve.PumpRun:
+    """The ticks of an experiment with pump commands; the hold before and after it does not count."""
+    tune = [row for row in rows if row.state == states.State.TUNE][1:]  # the first still has the loop's command
+    columns = (
+        [getattr(row, name) for row in tune] for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")
+    )
+    return pump_curve.PumpRun(dt_s, *(np.array(column, dtype=float) for column in columns))

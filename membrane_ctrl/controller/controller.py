@@ -330,9 +330,7 @@ class Controller:
         experiment = self._scene.trial
         assert experiment is not None
         ended = self._scene.trial_ended or machine.Finished(False, why)
-        events.append(
-            told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, experiment.pump_map())
-        )
+        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason))
 
     def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line once its words (not its numbers) have changed durably."""

@@ -89,23 +89,39 @@ def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind:
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
-def test_the_pump_map_comes_back_as_a_result() -> None:
+STEPS = [
+    {"fraction": 0.0, "duration_s": 20.0, "until_um": -3.0},
+    {"fraction": 0.6, "duration_s": 20.0, "until_um": 2.0},
+    {"fraction": 0.31, "duration_s": 1.0},
+]
+
+
+def test_a_pump_map_gives_its_commands_until_the_heights() -> None:
+    """Down 3 um at 1.24 um/s, up 5 um at 1.7 um/s, then a second at the holding command."""
     held = Held()
-    held.go(0.1, tune(kind="pump_map", duration_s=900.0))
-    held.until_hold(900.0)
-    told = held.of("experiment")[-1]
-    assert told["completed"], told["reason"]
-    assert told["pump_map"]["start_fraction"] == pytest.approx(0.22, abs=0.03)
-    assert told["pump_map"]["leak_um_per_s"] == pytest.approx(1.24, abs=0.1)
+    held.go(0.1, tune(kind="pump_map", duration_s=60.0, steps=STEPS))
+    held.until_hold(60.0)
+    assert held.of("experiment")[-1]["completed"]
+    given = [row.pump_fraction for row in held.rows if row.state == State.TUNE][1:]
+    lengths_s = [0.02 * given.count(step["fraction"]) for step in STEPS]
+    assert sum(lengths_s) == pytest.approx(0.02 * len(given), abs=0.05)
+    assert lengths_s == [pytest.approx(2.5, abs=1.0), pytest.approx(3.0, abs=1.0), pytest.approx(1.0, abs=0.05)]
     held.go(30.0)
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
 def test_a_pump_map_that_takes_too_long_is_ended() -> None:
     held = Held()
-    held.go(0.1, tune(kind="pump_map", duration_s=10.0))
+    held.go(0.1, tune(kind="pump_map", duration_s=5.0, steps=[{"fraction": 0.31, "duration_s": 60.0}]))
     held.until_hold(12.0)
-    assert "not done within 10 s" in held.of("experiment")[-1]["reason"]
+    assert "not done within 5 s" in held.of("experiment")[-1]["reason"]
+
+
+def test_a_pump_map_without_steps_is_refused() -> None:
+    held = Held()
+    held.go(0.1, tune(kind="pump_map"))
+    assert "without steps" in held.of("command")[-1]["refused"]
+    assert held.state == State.HOLD
 
 
 def test_a_door_ends_it_and_the_mirror_is_held() -> None:

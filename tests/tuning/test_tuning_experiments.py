@@ -21,7 +21,6 @@ from membrane_ctrl.control.experiments.machine import (
     multisine,
     steps,
 )
-from membrane_ctrl.control.experiments.pump_map import PumpMapper
 from membrane_ctrl.sim.bench_events import AmbientChange, LaserDropout
 from tuning.identification.characterise import ExperimentError, characterise
 from tuning.identification.records import Record
@@ -207,38 +206,9 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
     assert np.abs(after.flow_um_per_s - around.holding_flow_um_per_s).max() < 0.05
 
 
-def test_pump_map_finds_start_stall_leak_and_curve() -> None:
-    bench = TwinBench(Case("quiet"), 2)
-    mapper = PumpMapper(0.0, 0.31, 1.24)
-    measurement = bench.exchange(0.31, 0.0)
-    while not isinstance(command := mapper.step(measurement, 0.02), Finished):
-        measurement = bench.exchange(command, 0.0)
-    found = mapper.result
-    assert command.completed
-    assert found is not None
-    assert found.start_fraction == pytest.approx(0.22, abs=0.02)
-    assert found.stall_fraction == pytest.approx(0.15, abs=0.02)
-    assert found.sticks_by > 0.03
-    assert found.leak_um_per_s == pytest.approx(1.24, abs=max(4 * found.leak_sigma_um_per_s, 0.05))
-    assert found.flow_full_um_per_s == pytest.approx(5.3, rel=0.1)
-    assert not found.too_tight
-    assert max(abs(x) for x in bench.true_um) < 10.0
-    assert found.applied_to(PumpConfig()).start_fraction == found.start_fraction
-
-
 def test_the_noise_kept_in_hand_is_that_of_the_tick_rate() -> None:
     """4 um of laser noise leave something of 10 um at 50 readings a second (3 x 0.652 x 4), nothing at 25."""
     noisy = replace(AROUND, laser_um=4.0)
     ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=50.0)
     with pytest.raises(ValueError, match=r"takes 11\.1 um of it at 25 readings/s; give a larger limit"):
         ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=25.0)
-
-
-def test_pump_map_says_when_there_is_no_pump() -> None:
-    bench = TwinBench(Case("calm", laser_noise_um=0.3), 1)
-    mapper = PumpMapper(0.0, 0.31, 1.24)
-    measurement = bench.exchange(0.0, 0.0)
-    while not isinstance(command := mapper.step(measurement, 0.02), Finished):
-        measurement = bench.exchange(0.0, 0.0)
-    assert not command.completed
-    assert "no pump" in command.reason

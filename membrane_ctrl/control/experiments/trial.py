@@ -29,6 +29,7 @@ class ExperimentSpec(Section):
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
+    steps: Annotated[tuple[pump_map.PumpStep, ...], Field(max_length=100)] = ()  # of the pump map
 
 
 _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
@@ -43,7 +44,6 @@ class Trial:
 
     def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
         self.spec = spec
-        self._mapper: pump_map.PumpMapper | None = None
         around = machine.Around(
             holding_flow_um_per_s=spec.holding_flow_um_per_s,
             least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
@@ -51,19 +51,18 @@ class Trial:
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
         )
-        experiment = self._machine(around, pump, centre_um)
+        experiment = self._machine(around, centre_um)
         self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz)
         self._left_s = spec.duration_s
 
-    def _machine(self, around: machine.Around, pump: PumpConfig, centre_um: float) -> machine.Experiment:
+    def _machine(self, around: machine.Around, centre_um: float) -> machine.Experiment:
         spec = self.spec
         if spec.kind == "relay":
             return machine.Relay(around, centre_um, spec.duration_s)
         if spec.kind == "pump_map":
-            share = spec.holding_flow_um_per_s / pump.flow_full_um_per_s
-            fraction = pump.dead_fraction + (1 - pump.dead_fraction) * share
-            self._mapper = pump_map.PumpMapper(centre_um, fraction, spec.holding_flow_um_per_s)
-            return self._mapper
+            if not spec.steps:
+                raise ValueError("a pump map without steps: use `tune pump`")
+            return pump_map.PumpSteps(centre_um, spec.steps)
         return machine.Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
 
     @property
@@ -79,8 +78,3 @@ class Trial:
                 False, f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump"
             )
         return self._guard.step(measurement, dt_s)
-
-    def pump_map(self) -> dict[str, float | None] | None:
-        """What a map of the pump has measured, as plain data; None for what it did not find."""
-        found = self._mapper.result if self._mapper is not None else None
-        return None if found is None else found.as_plain()

@@ -1,0 +1,338 @@
+"""Which commands to give next, until the pump's curve is known, and the curve they say.
+
+A round is a minute or two of short runs, each from below the centre to above it or back; the hold between two rounds
+brings the mirror back. What is known so far says how long a command may last. Levels are added where the curve bends
+or jumps, and repeated until they are known.
+"""
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control.experiments.pump_map import PumpStep
+from membrane_ctrl.model.arrays import FloatArray
+from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
+
+_KNOWN_SHARE = 0.015  # standard error of a level, of the full flow
+_BENT_SHARE = 0.03  # a level that its neighbours predict worse than this gets nearer neighbours
+_JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
+_EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
+_MOST_ROUNDS, _MOST_S, _ROUND_S = 20, 900.0, 120.0
+TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
+_TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
+_PULSE_S, _LONGEST_S = 0.2, 20.0
+_MOST_VISITS = 6
+_SCOUTS = (0.25, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PumpMap:
+    """`pump_map.json`: what was measured. Flows in um/s."""
+
+    fraction: tuple[float, ...]  # levels reached from below
+    flow_um_per_s: tuple[float, ...]
+    sigma_um_per_s: tuple[float, ...]
+    pump: PumpConfig
+    leak_um_per_s: float
+    delay_s: float
+    lag_s: float
+    duration_s: float
+    known: bool  # every level to the accuracy wanted
+
+
+@dataclass
+class PumpSurvey:
+    """The rounds of a survey, as a step machine: `steps` to give, `take` what came of them.
+
+    Attributes
+    ----------
+    holding_fraction : float
+        Command that about holds the mirror.
+    limit_um : float
+        Excursion limit of an experiment.
+    """
+
+    holding_fraction: float
+    limit_um: float = 10.0
+    runs: list[PumpRun] = field(default_factory=list)
+    fit: PumpFit | None = None
+    _share: float = 1.0  # of the travel, smaller after a run that was stopped
+    _rounds: int = 0
+    _wanted: set[Level] = field(default_factory=set)
+    _unreachable: float = math.inf
+
+    @property
+    def duration_s(self) -> float:
+        """Of all experiments so far."""
+        return sum(run.dt_s * run.fraction.size for run in self.runs)
+
+    def take(self, run: PumpRun, completed: bool) -> None:
+        """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
+        self._rounds += 1
+        self._share = min(1.0, self._share * (1.2 if completed else 0.75))
+        if run.fraction.size * run.dt_s > 4.0:
+            self.runs.append(run)
+        if self.runs:
+            self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
+
+    def steps(self) -> tuple[PumpStep, ...]:
+        """The next round; empty when the curve is known, or cannot be known better in the time."""
+        if self.fit is None:
+            first, low_um = min(1.0, self.holding_fraction + 0.1), -2.0 * self._share
+            pulse = [_for(0.0, 20.0, low_um), _for(first, 1.2 * self._share, 0.0), _for(0.0, 0.8)]
+            return tuple(4 * pulse)
+        if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
+            return ()
+        self._want()
+        visits = self._visits()
+        made: list[PumpStep] = []
+        left_s = _ROUND_S
+        for level in visits:
+            visit = self._visit(level)
+            left_s -= self._lasts_s(level)
+            if made and (left_s < 0 or len(made) + len(visit) > 90):
+                break
+            made += visit
+        return tuple(made)
+
+    @property
+    def full_um_per_s(self) -> float:
+        """The largest flow seen."""
+        assert self.fit is not None
+        return max((at.flow_um_per_s for at in self.fit.levels.values()), default=0.0)
+
+    def known(self, level: Level) -> bool:
+        """Whether its flow is known well enough."""
+        at = self.fit.levels.get(level) if self.fit is not None else None
+        return at is not None and at.sigma_um_per_s <= _KNOWN_SHARE * self.full_um_per_s
+
+    def branch(self, rising: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Commands, flows that never fall, and standard errors of one branch, from no flow at command 0."""
+        assert self.fit is not None
+        from scipy.optimize import isotonic_regression
+
+        at = {level.fraction: flow for level, flow in self.fit.levels.items() if level.rising == rising}
+        at[0.0] = FlowAt(0.0, 1e-3)
+        fractions = np.array(sorted(at))
+        flows, sigmas = (
+            np.array([getattr(at[f], name) for f in fractions.tolist()])
+            for name in ("flow_um_per_s", "sigma_um_per_s")
+        )
+        smooth = isotonic_regression(np.maximum(flows, 0.0), weights=sigmas**-2.0).x
+        return fractions, np.asarray(smooth), sigmas
+
+    def start(self) -> tuple[float, float] | None:
+        """The command at which a standing pump starts with a flow at once, and the one below it, if it does."""
+        return _jump(*self.branch(True)[:2], self.full_um_per_s)
+
+    def hysteretic(self) -> bool:
+        """A level gives more when it is reached from above, beyond doubt."""
+        assert self.fit is not None
+        start = self.start()
+        for level, above in self.fit.levels.items():
+            below = self.fit.levels.get(Level(level.fraction))
+            if level.rising or below is None or (start is not None and level.fraction < start[1]):
+                continue
+            more = above.flow_um_per_s - below.flow_um_per_s
+            sigma = math.hypot(above.sigma_um_per_s, below.sigma_um_per_s)
+            if more > max(3 * sigma, _BENT_SHARE * self.full_um_per_s):
+                return True
+        return False
+
+    def _want(self) -> None:
+        """Add levels: scouts first, then where the curve bends or jumps, then those reached from above."""
+        assert self.fit is not None
+        if not self._wanted:
+            low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
+            self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {Level(high)}
+            self._wanted |= {Level(_rounded(low * share)) for share in _SCOUTS}
+        seen = all(level in self.fit.levels for level in self._wanted if level.fraction < self._unreachable)
+        if seen:
+            self._wanted |= {Level(f) for f in self._finer(True)}
+        if any(not level.rising for level in self._wanted):
+            self._wanted |= {Level(f, False) for f in self._finer(False)}
+        if (seen and self.start() is not None) or self.done:
+            self._wanted |= {Level(f, False) for f in self._from_above()}
+
+    @property
+    def done(self) -> bool:
+        """Every level wanted so far is known."""
+        return all(self.known(level) for level in self._wanted if level.fraction < self._unreachable)
+
+    def _finer(self, rising: bool) -> list[float]:
+        """Commands between those of a branch, where it bends or jumps."""
+        from scipy.interpolate import PchipInterpolator
+
+        fractions, flows, sigmas = self.branch(rising)
+        full = self.full_um_per_s
+        found: list[float] = []
+        for i, (low, high) in enumerate(pairwise(fractions.tolist())):
+            clear = flows[i + 1] - flows[i] > 4 * math.hypot(sigmas[i], sigmas[i + 1])
+            if clear and flows[i] < 0.02 * full and flows[i + 1] > _JUMP_SHARE * full and high - low > _EDGE:
+                found.append(_rounded((low + high) / 2))
+        if not rising:
+            return found
+        for i in range(1, fractions.size - 1):
+            others = np.arange(fractions.size) != i
+            off = abs(float(PchipInterpolator(fractions[others], flows[others])(fractions[i])) - flows[i])
+            for low, high in pairwise(fractions[i - 1 : i + 2].tolist()):
+                if off > _BENT_SHARE * full + 2 * sigmas[i] and high - low > _NEAREST:
+                    found.append(_rounded((low + high) / 2))
+        return found
+
+    def _from_above(self) -> list[float]:
+        """Commands to reach from above: two for hysteresis, all if there is any; below the start for the stall."""
+        fractions, flows, _ = self.branch(True)
+        reached = fractions[fractions < self._unreachable]
+        found = [
+            float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))]) for s in (0.3, 0.6)
+        ]
+        start = self.start()
+        if start is not None:
+            found += [_rounded(start[1] / 2), start[1]]
+        if self.hysteretic():
+            found += reached[1:-1].tolist()
+        return [f for f in found if f > 0]
+
+    def _visits(self) -> list[Level]:
+        """Levels to visit in the next round: new ones once, small ones first, or others as often as they ask for."""
+        assert self.fit is not None
+        open_ = sorted(
+            level for level in self._wanted if not self.known(level) and level.fraction < self._unreachable
+        )
+        fresh = [level for level in open_ if level not in self.fit.levels]
+        open_ = [level for level in open_ if level in self.fit.levels]
+        asked = {
+            level: (self.fit.levels[level].sigma_um_per_s / self.full_um_per_s / _KNOWN_SHARE) ** 2 for level in open_
+        }
+        return fresh + [level for turn in range(_MOST_VISITS) for level in open_ if asked[level] > turn]
+
+    def _guess(self, fraction: float) -> float:
+        """Flow that a command may have, rather too large: beyond the largest known one like a square."""
+        assert self.fit is not None
+        fractions, flows, sigmas = self.branch(True)
+        sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) | (fractions == 0)
+        fractions, flows = fractions[sure], flows[sure]
+        if fraction <= fractions[-1] or fractions.size < 2:
+            return float(np.interp(fraction, fractions, flows))
+        none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
+        return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
+
+    def _visit(self, level: Level) -> list[PumpStep]:
+        """From where the mirror may be to the level's run, and until its gas has arrived."""
+        assert self.fit is not None
+        leak, travel_um = max(self.fit.leak_um_per_s, 0.05), self._travel_um
+        run, up = _for(level.fraction, self._run_s(level)), self._up()
+        if self._net(level) > 0:
+            if run.duration_s * self._net(level) > 1.3 * self.limit_um:
+                self._unreachable = min(self._unreachable, level.fraction)
+                return []
+            bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
+            above = [] if level.rising else [_for(self._higher(level), 0.1)]
+            down = _for(0.0, 60.0, min(bottom_um + leak * (self.fit.delay_s + self.fit.lag_s), 0.0))
+            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, _for(0.0, max(0.3, self.fit.answer_s))]
+        top_um = max(0.5 * travel_um - self._net(Level(up)) * self.fit.answer_s, -0.2 * travel_um)
+        rest = [_for(0.0, 0.3)] if level.rising else []
+        return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, 60.0, top_um), *rest, run]
+
+    @property
+    def _travel_um(self) -> float:
+        return _TRAVEL_UM * self._share * self.limit_um / 10.0
+
+    def _net(self, level: Level) -> float:
+        assert self.fit is not None
+        return self._guess(level.fraction) - self.fit.leak_um_per_s
+
+    def _run_s(self, level: Level) -> float:
+        assert self.fit is not None
+        fresh = level not in self.fit.levels
+        way_um = self._travel_um * (0.6 if fresh else 1.0)
+        return min(max(way_um / max(abs(self._net(level)), 0.05), _PULSE_S), _LONGEST_S)
+
+    def _lasts_s(self, level: Level) -> float:
+        assert self.fit is not None
+        leak = max(self.fit.leak_um_per_s, 0.05)
+        return (
+            self._run_s(level) * (1 + max(self._net(level), 0.0) / leak) + self.fit.answer_s + self._travel_um / leak
+        )
+
+    def _higher(self, level: Level) -> float:
+        """A larger command, from which a level is reached."""
+        above = [other.fraction for other in self._wanted if other.fraction > level.fraction + 0.05]
+        return min(above, default=1.0)
+
+    def _up(self) -> float:
+        """The smallest known command that lifts the mirror well; the largest if none does."""
+        assert self.fit is not None
+        fractions, flows, sigmas = self.branch(True)
+        lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
+        return float(lifts[0] if lifts.size else fractions[-1])
+
+    def result(self) -> PumpMap:
+        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
+        from scipy.optimize import isotonic_regression
+
+        if self.fit is None:
+            raise ValueError(
+                "the experiments were stopped too early: steadier weather, or a larger limit, would help"
+            )
+        fractions, flows, sigmas = self.branch(True)
+        leak, full = self.fit.leak_um_per_s, float(flows[-1])
+        if full < max(5 * float(sigmas[-1]), 0.1 * abs(leak)):
+            raise ValueError(
+                f"the mirror moves alike at every command ({full:.2f} +- {sigmas[-1]:.2f} um/s more at "
+                f"{fractions[-1]:.2f} than at 0): the pump is stuck, or its gas does not arrive"
+            )
+        if full < leak:
+            raise ValueError(
+                f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
+                "take a stronger pump"
+            )
+        start, above = self.start(), self.branch(False)
+        begin, stall = 0.0, 0.0
+        if start is not None:
+            begin = stall = start[1]
+            stalls = _jump(above[0], above[1], full) if above[0].size > 1 else None
+            stall = min(begin, stalls[1]) if stalls is not None else begin
+        falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
+        rising = {f: v for f, v in zip(fractions.tolist(), flows.tolist(), strict=True) if f >= begin}
+        points = sorted({**falling, **rising}.items())
+        while len(points) > 2 and points[1][1] <= 0.005 * full:
+            points.pop(0)
+        while len(points) > 2 and points[-2][1] >= 0.995 * full:
+            points.pop()
+        xs, ys = np.array(points).T
+        table: dict[str, object] = {"curve_fraction": _tuple(xs), "curve_um_per_s": _tuple(isotonic_regression(ys).x)}
+        if self.hysteretic():
+            more = np.maximum(np.interp(xs, above[0], above[1]), isotonic_regression(ys).x)
+            more[-1] = ys[-1]
+            table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
+        pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
+        return PumpMap(
+            _tuple(fractions), _tuple(flows), _tuple(sigmas), pump, leak, self.fit.delay_s, self.fit.lag_s,
+            self.duration_s, self.done,
+        )  # fmt: skip
+
+
+def _jump(fractions: FloatArray, flows: FloatArray, full: float) -> tuple[float, float] | None:
+    """Commands just below and at the first flow, if that is a jump."""
+    for (low, high), (before, after) in zip(pairwise(fractions.tolist()), pairwise(flows.tolist()), strict=True):
+        if before < 0.02 * full <= after:
+            steep = after > _JUMP_SHARE * full and high - low <= _EDGE_MOST
+            return (low, high) if steep else None
+    return None
+
+
+def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
+    return PumpStep(fraction=_rounded(fraction), duration_s=round(duration_s, 2), until_um=until_um)
+
+
+def _rounded(fraction: float) -> float:
+    return round(fraction, 3)
+
+
+def _tuple(values: FloatArray) -> tuple[float, ...]:
+    return tuple(round(value, 4) for value in values.tolist())
