@@ -48,7 +48,7 @@ _STEPS = {
     "apply": "Apply the gains that you choose on trial; they revert unless `verify` keeps them.",
     "verify": "Verify the new gains over ten minutes of hold; keep them, or revert (exit 3).",
     "run": "Run all steps that are not done yet; shows the candidates and asks before any gains change.",
-    "pump": "Map the pump (start, stall, gain, leak); later steps of the session use it.",
+    "pump": "Measure the pump's curve (flow, start, stall, delay) and the leak, for [pump].",
     "outer": "Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant.",
     "watch": "Watch a hold without touching it; report whether a session is due (exit 3).",
     "rollback": "Restore the gains from before the last kept session.",

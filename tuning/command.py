@@ -121,8 +121,8 @@ def map_pump(options: TuneOptions) -> int:
         progress.say(
             f"{len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
             f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} um/s at {pump.curve_fraction[-1]:.3f}, "
-            f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; starts at "
-            f"{pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
+            f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; "
+            f"starts at {pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
             f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after {found.delay_s:.2f} s "
             f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s; [pump] for the configuration: "
             f"{folder.file('pump.toml')}"

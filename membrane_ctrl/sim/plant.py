@@ -29,7 +29,7 @@ _LEVELS = 4096  # of a tabulated curve: 12 bits
 class PumpModel:
     """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
 
-    Or a curve through the configuration's points, or a shape of `twin.pump_shape`; with two branches the flow has play.
+    Or a curve through the configuration's points, or of `twin.pump_shape`; two branches give the flow play.
     Raises ValueError if the pump delivers nothing at any command.
     """
 

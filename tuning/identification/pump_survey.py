@@ -16,7 +16,7 @@ from membrane_ctrl.control.experiments.pump_map import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
 
-_KNOWN_SHARE = 0.015  # standard error of a level, of the full flow
+_KNOWN_SHARE = 0.012  # standard error of a level, of the full flow
 _BENT_SHARE = 0.03  # a level that its neighbours predict worse than this gets nearer neighbours
 _JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
