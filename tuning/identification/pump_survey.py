@@ -58,7 +58,7 @@ class PumpSurvey:
     holding_fraction: float
     limit_um: float = 10.0
     runs: list[PumpRun] = field(default_factory=list)
-    fit: PumpFit | None = None
+    fit: PumpFit = field(default_factory=lambda: PumpFit({}, 0.0, 0.0, 0.0, 0.8))
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _rounds: int = 0
     _wanted: set[Level] = field(default_factory=set)
@@ -80,17 +80,16 @@ class PumpSurvey:
 
     def steps(self) -> tuple[PumpStep, ...]:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
-        if self.fit is None:
+        if not self.fit.levels:
             first, low_um = min(1.0, self.holding_fraction + 0.1), -2.0 * self._share
             pulse = [_for(0.0, 20.0, low_um), _for(first, 1.2 * self._share, 0.0), _for(0.0, 0.8)]
             return tuple(4 * pulse)
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         self._want()
-        visits = self._visits()
         made: list[PumpStep] = []
         left_s = _ROUND_S
-        for level in visits:
+        for level in self._visits():
             visit = self._visit(level)
             left_s -= self._lasts_s(level)
             if made and (left_s < 0 or len(made) + len(visit) > 90):
@@ -101,26 +100,22 @@ class PumpSurvey:
     @property
     def full_um_per_s(self) -> float:
         """The largest flow seen."""
-        assert self.fit is not None
         return max((at.flow_um_per_s for at in self.fit.levels.values()), default=0.0)
 
     def known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
-        at = self.fit.levels.get(level) if self.fit is not None else None
+        at = self.fit.levels.get(level)
         return at is not None and at.sigma_um_per_s <= _KNOWN_SHARE * self.full_um_per_s
 
     def branch(self, rising: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Commands, flows that never fall, and standard errors of one branch, from no flow at command 0."""
-        assert self.fit is not None
         from scipy.optimize import isotonic_regression
 
         at = {level.fraction: flow for level, flow in self.fit.levels.items() if level.rising == rising}
         at[0.0] = FlowAt(0.0, 1e-3)
         fractions = np.array(sorted(at))
-        flows, sigmas = (
-            np.array([getattr(at[f], name) for f in fractions.tolist()])
-            for name in ("flow_um_per_s", "sigma_um_per_s")
-        )
+        flows = np.array([at[f].flow_um_per_s for f in fractions.tolist()])
+        sigmas = np.array([at[f].sigma_um_per_s for f in fractions.tolist()])
         smooth = isotonic_regression(np.maximum(flows, 0.0), weights=sigmas**-2.0).x
         return fractions, np.asarray(smooth), sigmas
 
@@ -130,7 +125,6 @@ class PumpSurvey:
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
-        assert self.fit is not None
         start = self.start()
         for level, above in self.fit.levels.items():
             below = self.fit.levels.get(Level(level.fraction))
@@ -144,7 +138,6 @@ class PumpSurvey:
 
     def _want(self) -> None:
         """Add levels: scouts first, then where the curve bends or jumps, then those reached from above."""
-        assert self.fit is not None
         if not self._wanted:
             low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
             self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {Level(high)}
@@ -199,20 +192,19 @@ class PumpSurvey:
 
     def _visits(self) -> list[Level]:
         """Levels to visit in the next round: new ones once, small ones first, or others as often as they ask for."""
-        assert self.fit is not None
-        open_ = sorted(
-            level for level in self._wanted if not self.known(level) and level.fraction < self._unreachable
-        )
-        fresh = [level for level in open_ if level not in self.fit.levels]
-        open_ = [level for level in open_ if level in self.fit.levels]
-        asked = {
-            level: (self.fit.levels[level].sigma_um_per_s / self.full_um_per_s / _KNOWN_SHARE) ** 2 for level in open_
-        }
-        return fresh + [level for turn in range(_MOST_VISITS) for level in open_ if asked[level] > turn]
+        wanted = sorted(level for level in self._wanted if level.fraction < self._unreachable)
+        fresh = [level for level in wanted if level not in self.fit.levels]
+        wide = _KNOWN_SHARE * self.full_um_per_s
+        asked = [
+            (self.fit.levels[level].sigma_um_per_s / wide) ** 2 if level not in fresh else 0.0 for level in wanted
+        ]
+        again = [
+            level for turn in range(_MOST_VISITS) for level, n in zip(wanted, asked, strict=True) if n > max(turn, 1)
+        ]
+        return fresh + again
 
     def _guess(self, fraction: float) -> float:
         """Flow that a command may have, rather too large: beyond the largest known one like a square."""
-        assert self.fit is not None
         fractions, flows, sigmas = self.branch(True)
         sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) | (fractions == 0)
         fractions, flows = fractions[sure], flows[sure]
@@ -223,7 +215,6 @@ class PumpSurvey:
 
     def _visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
-        assert self.fit is not None
         leak, travel_um = max(self.fit.leak_um_per_s, 0.05), self._travel_um
         run, up = _for(level.fraction, self._run_s(level)), self._up()
         if self._net(level) > 0:
@@ -243,17 +234,14 @@ class PumpSurvey:
         return _TRAVEL_UM * self._share * self.limit_um / 10.0
 
     def _net(self, level: Level) -> float:
-        assert self.fit is not None
         return self._guess(level.fraction) - self.fit.leak_um_per_s
 
     def _run_s(self, level: Level) -> float:
-        assert self.fit is not None
         fresh = level not in self.fit.levels
         way_um = self._travel_um * (0.6 if fresh else 1.0)
         return min(max(way_um / max(abs(self._net(level)), 0.05), _PULSE_S), _LONGEST_S)
 
     def _lasts_s(self, level: Level) -> float:
-        assert self.fit is not None
         leak = max(self.fit.leak_um_per_s, 0.05)
         return (
             self._run_s(level) * (1 + max(self._net(level), 0.0) / leak) + self.fit.answer_s + self._travel_um / leak
@@ -266,7 +254,6 @@ class PumpSurvey:
 
     def _up(self) -> float:
         """The smallest known command that lifts the mirror well; the largest if none does."""
-        assert self.fit is not None
         fractions, flows, sigmas = self.branch(True)
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         return float(lifts[0] if lifts.size else fractions[-1])
@@ -275,7 +262,7 @@ class PumpSurvey:
         """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
         from scipy.optimize import isotonic_regression
 
-        if self.fit is None:
+        if not self.fit.levels:
             raise ValueError(
                 "the experiments were stopped too early: steadier weather, or a larger limit, would help"
             )
@@ -295,7 +282,7 @@ class PumpSurvey:
         begin, stall = 0.0, 0.0
         if start is not None:
             begin = stall = start[1]
-            stalls = _jump(above[0], above[1], full) if above[0].size > 1 else None
+            stalls = _jump(above[0], above[1], full)
             stall = min(begin, stalls[1]) if stalls is not None else begin
         falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
         rising = {f: v for f, v in zip(fractions.tolist(), flows.tolist(), strict=True) if f >= begin}
