@@ -78,7 +78,7 @@ class PumpConfig(Section):
     def _full_flow_of_the_curve(cls, table: Any) -> Any:
         """The full flow of a measured curve is its last one."""
         flows = table.get("curve_um_per_s") if isinstance(table, dict) else None
-        if isinstance(flows, list | tuple) and flows:
+        if isinstance(flows, list | tuple) and flows and isinstance(flows[-1], int | float):
             return {"flow_full_um_per_s": flows[-1], **table}
         return table
 

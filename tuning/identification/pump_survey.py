@@ -194,7 +194,7 @@ class PumpSurvey:
         """Levels to visit in the next round: new ones once, small ones first, or others as often as they ask for."""
         wanted = sorted(level for level in self._wanted if level.fraction < self._unreachable)
         fresh = [level for level in wanted if level not in self.fit.levels]
-        wide = _KNOWN_SHARE * self.full_um_per_s
+        wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
         asked = [
             (self.fit.levels[level].sigma_um_per_s / wide) ** 2 if level not in fresh else 0.0 for level in wanted
         ]
