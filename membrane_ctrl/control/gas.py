@@ -72,6 +72,11 @@ class _Measured:
         return _between(self._flows, self._fractions, flow_um_per_s)
 
 
+def _branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _Branch:
+    """One branch of the pump's own: no two share one, because a controller's memory is a tree."""
+    return _Measured(pump.curve_fraction, flows_um_per_s) if flows_um_per_s else _StraightLine(pump)
+
+
 def _between(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
     """Linear interpolation, clamped to the ends."""
     right = min(max(bisect_right(xs, x), 1), len(xs) - 1)
@@ -120,12 +125,8 @@ class PumpCurve:
     def __init__(self, pump: PumpConfig) -> None:
         self._start_fraction = pump.start_fraction
         self._least_fraction = pump.stall_fraction + STALL_MARGIN
-        self._rising: _Branch = _StraightLine(pump)
-        if pump.curve_fraction:
-            self._rising = _Measured(pump.curve_fraction, pump.curve_um_per_s)
-        self._falling = self._rising
-        if pump.curve_falling_um_per_s:
-            self._falling = _Measured(pump.curve_fraction, pump.curve_falling_um_per_s)
+        self._rising = _branch(pump, pump.curve_um_per_s)
+        self._falling = _branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
         self._flow_um_per_s = 0.0
         self._kick_left_s = KICK_S
 
