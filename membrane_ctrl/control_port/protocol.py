@@ -60,7 +60,7 @@ class Request(Section):
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
     text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
-    experiment: dict[str, str | int | float] | None = None  # `tune`: an `ExperimentSpec`
+    experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
 

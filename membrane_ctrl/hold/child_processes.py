@@ -119,7 +119,7 @@ class ManagedChild:
 
 
 _TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
-_EVENTS_KEPT, _EVENT_BYTES = 1024, 4096
+_EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
 _SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
 _RECORDER_CLOSES_S = 30.0
 _CHILD_STOPS_S = 3.0
@@ -142,7 +142,7 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
     """Make the rings; the stack frees their memory."""
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
     rows = stack.enter_context(ring(kept, telemetry.ROW_BYTES))
-    events = stack.enter_context(ring(_EVENTS_KEPT, _EVENT_BYTES))
+    events = stack.enter_context(ring(_EVENTS_KEPT, EVENT_BYTES))
     inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
     camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
     if not camera or not config.shape.enabled:

@@ -26,6 +26,7 @@ from campaign_times import (
 from campaign_world import WatchedPlant
 
 from firmware_iface.register_map import default_map
+from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.states import Rung, State
@@ -41,7 +42,6 @@ _GAUGE_SLACK_PA = 2.0  # four sigma of the gauge
 _SLACK_S = 0.25  # six ticks
 _HELD_UM = 10.0  # an undisturbed mirror, in the strongest weather
 _STEADY = 0.02
-_EVENT_BYTES = 4096
 
 
 class Watch:
@@ -152,7 +152,7 @@ class Watch:
         for event in tick.events:
             if isinstance(event, Fault):
                 self.names[float(event.code)] = event.name
-            if len(json.dumps(event.to_dict(), allow_nan=False, default=str)) > _EVENT_BYTES:
+            if len(json.dumps(event.to_dict(), allow_nan=False, default=str)) > EVENT_BYTES:
                 self._say(now_s, f"an event of kind {event.kind} is too long to be recorded")
         if not (0.0 <= row.pump_fraction <= 1.0 and 0.0 <= row.vent_fraction <= 1.0):
             self._say(now_s, f"wrote pump {row.pump_fraction} and vent {row.vent_fraction}")

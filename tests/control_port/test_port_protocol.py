@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.protocol import (
     MESSAGE_BYTES,
     TEXT_BYTES,
@@ -15,12 +16,14 @@ from membrane_ctrl.control_port.protocol import (
     Errand,
     Request,
     RequestError,
+    encode,
     parse,
 )
 from membrane_ctrl.control_port.session import Peer, may_not
 from membrane_ctrl.controller.commands import TABLE, Kind
+from membrane_ctrl.hold.child_processes import EVENT_BYTES
+from membrane_ctrl.model.events import CommandTaken
 
-EVENT_SLOT_BYTES = 4096  # of the events ring
 ACTIONS = (*TABLE, *get_args(Errand))
 
 
@@ -95,7 +98,21 @@ def test_the_longest_words_fit_an_event() -> None:
         "command": "mark", "who": who, "why": request.why, "text": request.text,
         "value": 1.2345678901234567e-300, "refused": "r" * 400,
     }  # fmt: skip
-    assert len(json.dumps(event)) < EVENT_SLOT_BYTES
+    assert len(json.dumps(event)) < EVENT_BYTES
+
+
+def test_the_longest_pump_map_fits_a_message_and_an_event() -> None:
+    third = 1 / 3
+    steps = [{"fraction": third, "duration_s": 100 + third, "until_um": -29 - third}] * 90
+    around = {"holding_flow_um_per_s": 10 * third, "laser_um": third, "gain": third, "limit_um": 10 * third}
+    spec = ExperimentSpec.model_validate({"kind": "pump_map", "duration_s": 1000 * third, "steps": steps, **around})
+    message = encode({"number": 2**53 - 1, "do": "tune", "why": "y" * WHY_BYTES, "experiment": spec.model_dump()})
+    assert len(message) < MESSAGE_BYTES
+    assert ExperimentSpec.model_validate(parse(message).experiment) == spec
+    who, why = "é" * (WHO_BYTES // 2), "\U0001f9ca" * (WHY_BYTES // 4)
+    event = CommandTaken("tune", who, why, experiment=spec.model_dump(), refused="r" * 400)
+    stamp = {"time_utc": "2026-11-21T03:10:06.819914+00:00", "mono_s": 1234567.123456}
+    assert len(json.dumps(stamp | event.to_dict())) < EVENT_BYTES
 
 
 values = st.recursive(

@@ -314,7 +314,7 @@ def _jump(fractions: FloatArray, flows: FloatArray, full: float) -> tuple[float,
 
 
 def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
-    return PumpStep(fraction=_rounded(fraction), duration_s=round(duration_s, 2), until_um=until_um)
+    return PumpStep(fraction=fraction, duration_s=duration_s, until_um=until_um)
 
 
 def _rounded(fraction: float) -> float:

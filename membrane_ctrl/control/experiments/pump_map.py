@@ -7,18 +7,20 @@ are only given, one after the other, inside the excursion guard.
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from firmware_iface.settings import Fraction, Section
 from membrane_ctrl.control.experiments.machine import BenchSample, CentreMotion, Finished
+
+_Short = AfterValidator(lambda value: round(value, 3))  # ninety steps fit one message
 
 
 class PumpStep(Section):
     """A command until the time is over or, if a height is given, the centre has sunk (command 0) or risen to it."""
 
-    fraction: Fraction
-    duration_s: Annotated[float, Field(gt=0, le=120)]
-    until_um: Annotated[float, Field(ge=-30, le=30)] | None = None  # from where the experiment began
+    fraction: Annotated[Fraction, _Short]
+    duration_s: Annotated[float, Field(ge=0.01, le=120), _Short]
+    until_um: Annotated[float, Field(ge=-30, le=30), _Short] | None = None  # from where the experiment began
 
 
 class PumpSteps:

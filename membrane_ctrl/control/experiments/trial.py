@@ -29,7 +29,7 @@ class ExperimentSpec(Section):
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
-    steps: Annotated[tuple[pump_map.PumpStep, ...], Field(max_length=100)] = ()  # of the pump map
+    steps: Annotated[tuple[pump_map.PumpStep, ...], Field(max_length=90)] = ()  # of the pump map
 
 
 _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
