@@ -204,7 +204,7 @@ def _weather(strength: float, gusts: bool, rng: np.random.Generator) -> tuple[np
     if gusts:
         for at_s in np.cumsum(rng.exponential(40.0, round(_WEATHER_S / 40.0))):
             since = (time_s - at_s) / rng.uniform(1.5, 5.0)
-            pressure += rng.normal(0.0, 4.0) * np.where(since > 0, since * np.exp(1 - since), 0.0)
+            pressure += rng.normal(0.0, 4.0) * np.maximum(since, 0.0) * np.exp(1 - np.maximum(since, 0.0))
     period_s = rng.uniform(600.0, 1200.0)
     cycle = np.sin(2 * np.pi * time_s / period_s + rng.uniform(0, 6.28))
     return pressure, _AIR_K + 0.05 * strength * np.tanh(3 * cycle)

@@ -7,9 +7,9 @@ its curve, the flow at each command is one linear unknown. A command reached fro
 same one reached from below. The leak may change within a minute; n is white noise on a random walk.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from membrane_ctrl.model.arrays import FloatArray
 _BLOCK_S = 0.1
 _BEFORE_S = 8.0  # a flow that was on its way before the first command has arrived by then
 _LEAK_S = 40.0  # between the nodes of the leak's course
+_LEAK_CHANGES_UM_PER_S = 0.2  # what the weather's slow course looks like: 1.5 mK/s of the air
+_BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
 _WHITEST = 0.97
 _DELAYS_S, _LAGS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2), (0.1, 0.4, 1.0, 2.0)
 
@@ -69,7 +71,7 @@ class _Blocks:
     """A run in blocks of `_BLOCK_S`: the paths of its levels before the actuator, beginning before the run."""
 
     paths: FloatArray  # (before + n, levels + 1); the last is what flowed before
-    fixed: FloatArray  # (n, ...): nodes of the leak; the pressure is appended by `fit`
+    fixed: FloatArray  # (n, ...): nodes of the leak
     pressure_pa: FloatArray  # (n,)
     displacement_um: FloatArray  # (n,)
 
@@ -96,17 +98,16 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
     levels = sorted({level for run in runs for level in levels_of(run) if level is not None})
     blocks = [_blocks(run, levels) for run in runs]
     has_pressure = all(np.isfinite(block.pressure_pa).all() for block in blocks)
+    heights = [block.displacement_um for block in blocks]
+    noise_um = float(np.median(np.abs(np.hstack([np.diff(height, 2) for height in heights])))) / 0.6745 / math.sqrt(6)
 
-    def solved(at: FloatArray, pumping: Sequence[int]) -> tuple[float, FloatArray, FloatArray]:
-        rows = [_whitened(block, np.abs(at), has_pressure) for block in blocks]
-        design = _side_by_side([part for part, _ in rows], len(levels))
-        keep = [*pumping, *range(len(levels), design.shape[1])]
-        return _least_squares(design[:, keep], np.hstack([readings for _, readings in rows]))
+    def gram(at: FloatArray) -> FloatArray:
+        return np.sum([_gram(block, np.abs(at), has_pressure, noise_um) for block in blocks], axis=0)
 
-    every = list(range(len(levels)))
+    rows = sum(height.size for height in heights)
 
     def cost(at: FloatArray) -> float:
-        return solved(at, every)[0] if at[2] < _WHITEST else np.inf
+        return math.log(_least_squares(gram(at), rows)[0]) if at[2] < _WHITEST else math.inf
 
     starts = [np.array([near.delay_s, near.lag_s, near.share_white])] if near is not None else [
         np.array([delay_s, lag_s, 0.8]) for delay_s in _DELAYS_S for lag_s in _LAGS_S
@@ -117,17 +118,17 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
     options = {"maxfev": 60 if near is None else 25, "xatol": 0.003, "initial_simplex": simplex}
     best = minimize(cost, start, method="Nelder-Mead", options=options).x  # type: ignore[call-overload]
     # no pump takes gas out: what looks so is one without flow, and the rest is judged again without it
-    pumping, flows = every, dict[Level, FlowAt]()
-    while True:
-        _, values, sigmas = solved(best, pumping)
-        found = {levels[i]: FlowAt(float(values[k]), float(sigmas[k])) for k, i in enumerate(pumping)}
-        flows |= {level: FlowAt(max(at.flow_um_per_s, 0.0), at.sigma_um_per_s) for level, at in found.items()}
-        none = [i for i in pumping if found[levels[i]].flow_um_per_s < 0]
-        if not none:
-            break
-        pumping = [i for i in pumping if i not in none]
-    leaks = -values[len(pumping) : len(pumping) + sum(block.fixed.shape[1] for block in blocks)]
-    return PumpFit(flows, float(np.median(leaks)), *(float(abs(x)) for x in best))
+    whole, keep, none = gram(best), np.arange(len(levels) + 1 + has_pressure + 1), [True]
+    flows = dict[Level, FlowAt]()
+    while any(none):
+        _, values, sigmas = _least_squares(whole[np.ix_(keep, keep)], rows)
+        pumping = keep[keep < len(levels)]
+        none = [values[k] < 0 for k in range(pumping.size)]
+        for k, i in enumerate(pumping.tolist()):
+            flows[levels[i]] = FlowAt(max(float(values[k]), 0.0), float(sigmas[k]))
+        keep = np.delete(keep, np.flatnonzero(none))
+        leak_um_per_s = float(values[pumping.size])
+    return PumpFit(flows, leak_um_per_s, *(float(abs(x)) for x in best))
 
 
 def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
@@ -156,8 +157,28 @@ def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
     return _Blocks(paths, np.cumsum(hats, axis=0) * size * run.dt_s, mean(run.ambient_pressure_pa), mean(filled))
 
 
-def _whitened(block: _Blocks, at: FloatArray, has_pressure: bool) -> tuple[FloatArray, FloatArray]:
-    """Design and readings behind the actuator, differenced so that the noise is white."""
+def _gram(block: _Blocks, at: FloatArray, has_pressure: bool, noise_um: float) -> FloatArray:
+    """Products of the columns levels, leak, (pressure,) height of a run, after what belongs to this run alone.
+
+    These are the course of the leak, and what the pump gave before the run.
+    """
+    paths, nodes, rest = np.split(
+        _whitened(block, at), np.cumsum([block.paths.shape[1], block.fixed.shape[1]]), axis=1
+    )
+    levels, before = paths[:, :-1], paths[:, -1:]
+    leak = before - nodes.sum(axis=1, keepdims=True)  # before the run the pump gave what leaks
+    shared = np.hstack((levels, leak, rest if has_pressure else rest[:, 1:]))
+    own = np.hstack((nodes, before))
+    spread = np.full(own.shape[1], _LEAK_CHANGES_UM_PER_S)
+    spread[-1] = _BEFORE_UM_PER_S
+    across = own.T @ shared
+    return np.asarray(
+        shared.T @ shared - across.T @ np.linalg.solve(own.T @ own + np.diag((noise_um / spread) ** 2), across)
+    )
+
+
+def _whitened(block: _Blocks, at: FloatArray) -> FloatArray:
+    """Paths behind the actuator, leak, pressure and height, differenced so that the noise is white."""
     from scipy.signal import lfilter
 
     delay_s, lag_s, white = at
@@ -170,35 +191,15 @@ def _whitened(block: _Blocks, at: FloatArray, has_pressure: bool) -> tuple[Float
     paths = (1 - part) * held[1 : rows + 1] + part * held[:rows]
     keep = np.exp(-_BLOCK_S / max(lag_s, 1e-3))
     paths = lfilter([1 - keep], [1, -keep], paths - paths[0], axis=0)
-    columns = [paths[-block.displacement_um.size :], block.fixed]
-    if has_pressure:
-        columns.append(block.pressure_pa[:, None])
-    whole_design = np.column_stack((*columns, block.displacement_um))
-    steps = lfilter([1.0], [1.0, -white], np.diff(whole_design, axis=0), axis=0)
-    return np.asarray(steps[:, :-1]), np.asarray(steps[:, -1])
+    arrived = paths[-block.displacement_um.size :]
+    columns = np.column_stack((arrived, block.fixed, np.nan_to_num(block.pressure_pa), block.displacement_um))
+    return np.asarray(lfilter([1.0], [1.0, -white], np.diff(columns, axis=0), axis=0))
 
 
-def _side_by_side(designs: Sequence[FloatArray], shared: int) -> FloatArray:
-    """One design: the levels and the pressure are shared, the rest belongs to its run."""
-    own = [design[:, shared + 1 :] for design in designs]
-    first = np.vstack([design[:, :shared] for design in designs])
-    place = np.cumsum([0, *(part.shape[1] for part in own)])
-    rows = np.cumsum([0, *(part.shape[0] for part in own)])
-    rest = np.zeros((rows[-1], place[-1]))
-    for part, (top, bottom), (left, right) in zip(own, pairwise(rows), pairwise(place), strict=True):
-        rest[top:bottom, left:right] = part
-    before = np.zeros((rows[-1], len(designs)))
-    for i, (design, (top, bottom)) in enumerate(zip(designs, pairwise(rows), strict=True)):
-        before[top:bottom, i] = design[:, shared]
-    return np.hstack((first, rest, before))
-
-
-def _least_squares(design: FloatArray, readings: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Logarithm of the residual's variance (for the likelihood), values, standard errors."""
-    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-9)
-    normal = (design / scale).T @ (design / scale) + 1e-9 * np.eye(scale.size)
-    inverse = np.linalg.inv(normal)
-    values = inverse @ ((design / scale).T @ readings) / scale
-    residual = readings - design @ values
-    variance = float(residual @ residual) / max(1, readings.size - scale.size)
-    return float(np.log(variance)), values, np.sqrt(variance * np.diag(inverse)) / scale
+def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray]:
+    """Variance of the residual, values, standard errors: from the products of columns, the last one is the reading."""
+    scale = np.maximum(np.sqrt(np.diag(gram)[:-1]), 1e-9)
+    inverse = np.linalg.inv(gram[:-1, :-1] / np.outer(scale, scale) + 1e-9 * np.eye(scale.size))
+    values = inverse @ (gram[:-1, -1] / scale) / scale
+    variance = max(float(gram[-1, -1] - values @ gram[:-1, -1]) / max(1, rows - scale.size), 1e-12)
+    return variance, values, np.sqrt(variance * np.diag(inverse)) / scale
