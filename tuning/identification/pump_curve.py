@@ -20,7 +20,8 @@ _BEFORE_S = 8.0  # a flow that was on its way before the first command has arriv
 _LEAK_S = 40.0  # between the nodes of the leak's course
 _LEAK_CHANGES_UM_PER_S = 0.2  # what the weather's slow course looks like: 1.5 mK/s of the air
 _BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
-_WHITEST = 0.97
+_WHITEST = 0.995
+_ROUGHNESS = np.geomspace(0.5, 2e4, 16)  # of the curve: square of its second derivative, of the full flow
 _DELAYS_S, _LAGS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2), (0.1, 0.4, 1.0, 2.0)
 
 
@@ -48,6 +49,20 @@ class FlowAt:
 
     flow_um_per_s: float
     sigma_um_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """Flows in um/s of the commands reached from below, or of those from above, arrays (n,)."""
+
+    fractions: FloatArray
+    flows: FloatArray
+    sigmas: FloatArray
+
+    @property
+    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """All three."""
+        return self.fractions, self.flows, self.sigmas
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +117,7 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
     noise_um = float(np.median(np.abs(np.hstack([np.diff(height, 2) for height in heights])))) / 0.6745 / math.sqrt(6)
 
     def gram(at: FloatArray) -> FloatArray:
-        return np.sum([_gram(block, np.abs(at), has_pressure, noise_um) for block in blocks], axis=0)
+        return np.asarray(sum(_gram(block, np.abs(at), has_pressure, noise_um) for block in blocks))
 
     rows = sum(height.size for height in heights)
 
@@ -110,7 +125,7 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
         return math.log(_least_squares(gram(at), rows)[0]) if at[2] < _WHITEST else math.inf
 
     starts = [np.array([near.delay_s, near.lag_s, near.share_white])] if near is not None else [
-        np.array([delay_s, lag_s, 0.8]) for delay_s in _DELAYS_S for lag_s in _LAGS_S
+        np.array([delay_s, lag_s, 0.95]) for delay_s in _DELAYS_S for lag_s in _LAGS_S
     ]  # fmt: skip
     start = min(starts, key=cost)
     size = 0.15 if near is None else 0.04
@@ -160,7 +175,7 @@ def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
 def _gram(block: _Blocks, at: FloatArray, has_pressure: bool, noise_um: float) -> FloatArray:
     """Products of the columns levels, leak, (pressure,) height of a run, after what belongs to this run alone.
 
-    These are the course of the leak, and what the pump gave before the run.
+    These are the course of the leak, what the pump gave before the run, and the noise of the first reading.
     """
     paths, nodes, rest = np.split(
         _whitened(block, at), np.cumsum([block.paths.shape[1], block.fixed.shape[1]]), axis=1
@@ -168,9 +183,9 @@ def _gram(block: _Blocks, at: FloatArray, has_pressure: bool, noise_um: float) -
     levels, before = paths[:, :-1], paths[:, -1:]
     leak = before - nodes.sum(axis=1, keepdims=True)  # before the run the pump gave what leaks
     shared = np.hstack((levels, leak, rest if has_pressure else rest[:, 1:]))
-    own = np.hstack((nodes, before))
-    spread = np.full(own.shape[1], _LEAK_CHANGES_UM_PER_S)
-    spread[-1] = _BEFORE_UM_PER_S
+    first = at[2] ** np.arange(1, before.size + 1)[:, None]
+    own = np.hstack((nodes, before, first))
+    spread = np.array([*[_LEAK_CHANGES_UM_PER_S] * nodes.shape[1], _BEFORE_UM_PER_S, noise_um])
     across = own.T @ shared
     return np.asarray(
         shared.T @ shared - across.T @ np.linalg.solve(own.T @ own + np.diag((noise_um / spread) ** 2), across)
@@ -197,9 +212,26 @@ def _whitened(block: _Blocks, at: FloatArray) -> FloatArray:
 
 
 def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray]:
-    """Variance of the residual, values, standard errors: from the products of columns, the last one is the reading."""
+    """Variance of the residual, values, standard errors, from the columns' products; the last is the reading."""
     scale = np.maximum(np.sqrt(np.diag(gram)[:-1]), 1e-9)
     inverse = np.linalg.inv(gram[:-1, :-1] / np.outer(scale, scale) + 1e-9 * np.eye(scale.size))
     values = inverse @ (gram[:-1, -1] / scale) / scale
     variance = max(float(gram[-1, -1] - values @ gram[:-1, -1]) / max(1, rows - scale.size), 1e-12)
     return variance, values, np.sqrt(variance * np.diag(inverse)) / scale
+
+
+def smoothed(fractions: FloatArray, flows: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The likeliest cubic smoothing spline through noisy flows, and its standard errors (Wahba 1978)."""
+    x, full = fractions - fractions[0], max(float(flows.max()), 1e-3)
+    low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
+    bend, line = low**2 * (3 * high - low) / 6, 10.0 * (1 + np.outer(x, x))
+    noise = np.diag((sigmas / full) ** 2)
+
+    def unlikely(roughness: float) -> float:
+        covariance = line + roughness * bend + noise
+        y = flows / full
+        return float(y @ np.linalg.solve(covariance, y) + np.linalg.slogdet(covariance)[1])
+
+    free = line + min(_ROUGHNESS.tolist(), key=unlikely) * bend
+    weights = np.linalg.solve(free + noise, free).T
+    return weights @ flows, full * np.sqrt(np.maximum(np.diag(free - weights @ free), 1e-12))

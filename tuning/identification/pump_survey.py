@@ -14,18 +14,19 @@ import numpy as np
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.pump_map import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
+from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
 
-_KNOWN_SHARE = 0.012  # standard error of a level, of the full flow
+_KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _BENT_SHARE = 0.03  # a level that its neighbours predict worse than this gets nearer neighbours
 _JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
-_MOST_ROUNDS, _MOST_S, _ROUND_S = 20, 900.0, 120.0
+_MOST_ROUNDS, _MOST_S, _ROUND_S = 30, 900.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
+_FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ class PumpSurvey:
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _rounds: int = 0
     _wanted: set[Level] = field(default_factory=set)
-    _unreachable: float = math.inf
+    _branches: dict[bool, Branch] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:
@@ -72,20 +73,24 @@ class PumpSurvey:
     def take(self, run: PumpRun, completed: bool) -> None:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
-        self._share = min(1.0, self._share * (1.2 if completed else 0.75))
+        self._share = min(1.0, self._share * (1.2 if completed else 0.8))
         if run.fraction.size * run.dt_s > 4.0:
             self.runs.append(run)
         if self.runs:
             self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
+            self._branches = {rising: self._branch(rising) for rising in (True, False)}
 
     def steps(self) -> tuple[PumpStep, ...]:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
-        if not self.fit.levels:
-            first, low_um = min(1.0, self.holding_fraction + 0.1), -2.0 * self._share
-            pulse = [_for(0.0, 20.0, low_um), _for(first, 1.2 * self._share, 0.0), _for(0.0, 0.8)]
-            return tuple(4 * pulse)
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
+        if not self._sure()[0].size:
+            first = min(1.0, self.holding_fraction + 0.1)
+            pulses = [
+                (_for(0.0, 20.0, -1.5), _for(first, longest_s * self._share, 1.0), _for(0.0, 0.5))
+                for longest_s in _FIRST_PULSES_S
+            ]
+            return tuple(step for pulse in pulses for step in pulse)
         self._want()
         made: list[PumpStep] = []
         left_s = _ROUND_S
@@ -104,11 +109,17 @@ class PumpSurvey:
 
     def known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
-        at = self.fit.levels.get(level)
-        return at is not None and at.sigma_um_per_s <= _KNOWN_SHARE * self.full_um_per_s
+        return self.sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
 
-    def branch(self, rising: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Commands, flows that never fall, and standard errors of one branch, from no flow at command 0."""
+    def sigma(self, level: Level) -> float:
+        """Standard error of its flow in um/s, with what its neighbours tell; infinite for one not visited."""
+        if level not in self.fit.levels:
+            return math.inf
+        branch = self._branches[level.rising]
+        return float(branch.sigmas[np.searchsorted(branch.fractions, level.fraction)])
+
+    def _branch(self, rising: bool) -> Branch:
+        """One branch, from no flow at command 0; its flows never fall, and are as smooth as they look."""
         from scipy.optimize import isotonic_regression
 
         at = {level.fraction: flow for level, flow in self.fit.levels.items() if level.rising == rising}
@@ -116,12 +127,17 @@ class PumpSurvey:
         fractions = np.array(sorted(at))
         flows = np.array([at[f].flow_um_per_s for f in fractions.tolist()])
         sigmas = np.array([at[f].sigma_um_per_s for f in fractions.tolist()])
-        smooth = isotonic_regression(np.maximum(flows, 0.0), weights=sigmas**-2.0).x
-        return fractions, np.asarray(smooth), sigmas
+        rising_flows = np.asarray(isotonic_regression(flows, weights=sigmas**-2.0).x)
+        jump = _jump(fractions, rising_flows, self.full_um_per_s)
+        first = int(np.searchsorted(fractions, jump[1])) if jump is not None else 0
+        flows[:first] = rising_flows[:first]
+        flows[first:], sigmas[first:] = smoothed(fractions[first:], flows[first:], sigmas[first:])
+        return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
     def start(self) -> tuple[float, float] | None:
         """The command at which a standing pump starts with a flow at once, and the one below it, if it does."""
-        return _jump(*self.branch(True)[:2], self.full_um_per_s)
+        rising = self._branches[True]
+        return _jump(rising.fractions, rising.flows, self.full_um_per_s)
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
@@ -142,7 +158,7 @@ class PumpSurvey:
             low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
             self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {Level(high)}
             self._wanted |= {Level(_rounded(low * share)) for share in _SCOUTS}
-        seen = all(level in self.fit.levels for level in self._wanted if level.fraction < self._unreachable)
+        seen = all(level in self.fit.levels for level in self._wanted if self._reachable(level))
         if seen:
             self._wanted |= {Level(f) for f in self._finer(True)}
         if any(not level.rising for level in self._wanted):
@@ -153,13 +169,13 @@ class PumpSurvey:
     @property
     def done(self) -> bool:
         """Every level wanted so far is known."""
-        return all(self.known(level) for level in self._wanted if level.fraction < self._unreachable)
+        return all(self.known(level) for level in self._wanted if self._reachable(level))
 
     def _finer(self, rising: bool) -> list[float]:
         """Commands between those of a branch, where it bends or jumps."""
         from scipy.interpolate import PchipInterpolator
 
-        fractions, flows, sigmas = self.branch(rising)
+        fractions, flows, sigmas = self._branches[rising].columns
         full = self.full_um_per_s
         found: list[float] = []
         for i, (low, high) in enumerate(pairwise(fractions.tolist())):
@@ -178,8 +194,8 @@ class PumpSurvey:
 
     def _from_above(self) -> list[float]:
         """Commands to reach from above: two for hysteresis, all if there is any; below the start for the stall."""
-        fractions, flows, _ = self.branch(True)
-        reached = fractions[fractions < self._unreachable]
+        fractions, flows, _ = self._branches[True].columns
+        reached = np.array([f for f in fractions.tolist() if self._reachable(Level(f))])
         found = [
             float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))]) for s in (0.3, 0.6)
         ]
@@ -192,23 +208,27 @@ class PumpSurvey:
 
     def _visits(self) -> list[Level]:
         """Levels to visit in the next round: new ones once, small ones first, or others as often as they ask for."""
-        wanted = sorted(level for level in self._wanted if level.fraction < self._unreachable)
+        wanted = sorted(level for level in self._wanted if self._reachable(level))
         fresh = [level for level in wanted if level not in self.fit.levels]
         wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
-        asked = [
-            (self.fit.levels[level].sigma_um_per_s / wide) ** 2 if level not in fresh else 0.0 for level in wanted
-        ]
+        asked = [3 * (self.sigma(level) / wide) ** 2 if level not in fresh else 0.0 for level in wanted]
         again = [
-            level for turn in range(_MOST_VISITS) for level, n in zip(wanted, asked, strict=True) if n > max(turn, 1)
+            level for turn in range(_MOST_VISITS) for level, n in zip(wanted, asked, strict=True) if n > max(turn, 3)
         ]
         return fresh + again
 
+    def _sure(self) -> tuple[FloatArray, FloatArray]:
+        """Commands whose flows are known to a third, and the flows."""
+        if not self.runs:
+            return np.empty(0), np.empty(0)
+        fractions, flows, sigmas = self._branches[True].columns
+        sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) & (fractions > 0)
+        return fractions[sure], flows[sure]
+
     def _guess(self, fraction: float) -> float:
         """Flow that a command may have, rather too large: beyond the largest known one like a square."""
-        fractions, flows, sigmas = self.branch(True)
-        sure = (sigmas < 0.3 * np.maximum(flows, 0.3 * self.fit.leak_um_per_s)) | (fractions == 0)
-        fractions, flows = fractions[sure], flows[sure]
-        if fraction <= fractions[-1] or fractions.size < 2:
+        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        if fraction <= fractions[-1]:
             return float(np.interp(fraction, fractions, flows))
         none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
         return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
@@ -218,9 +238,6 @@ class PumpSurvey:
         leak, travel_um = max(self.fit.leak_um_per_s, 0.05), self._travel_um
         run, up = _for(level.fraction, self._run_s(level)), self._up()
         if self._net(level) > 0:
-            if run.duration_s * self._net(level) > 1.3 * self.limit_um:
-                self._unreachable = min(self._unreachable, level.fraction)
-                return []
             bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
             above = [] if level.rising else [_for(self._higher(level), 0.1)]
             down = _for(0.0, 60.0, min(bottom_um + leak * (self.fit.delay_s + self.fit.lag_s), 0.0))
@@ -235,6 +252,10 @@ class PumpSurvey:
 
     def _net(self, level: Level) -> float:
         return self._guess(level.fraction) - self.fit.leak_um_per_s
+
+    def _reachable(self, level: Level) -> bool:
+        """The shortest pulse of it leaves the mirror within its limit."""
+        return self._net(level) * _PULSE_S <= 1.3 * self.limit_um
 
     def _run_s(self, level: Level) -> float:
         fresh = level not in self.fit.levels
@@ -254,7 +275,7 @@ class PumpSurvey:
 
     def _up(self) -> float:
         """The smallest known command that lifts the mirror well; the largest if none does."""
-        fractions, flows, sigmas = self.branch(True)
+        fractions, flows, sigmas = self._branches[True].columns
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         return float(lifts[0] if lifts.size else fractions[-1])
 
@@ -266,7 +287,7 @@ class PumpSurvey:
             raise ValueError(
                 "the experiments were stopped too early: steadier weather, or a larger limit, would help"
             )
-        fractions, flows, sigmas = self.branch(True)
+        fractions, flows, sigmas = self._branches[True].columns
         leak, full = self.fit.leak_um_per_s, float(flows[-1])
         if full < max(5 * float(sigmas[-1]), 0.1 * abs(leak)):
             raise ValueError(
@@ -278,7 +299,7 @@ class PumpSurvey:
                 f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
                 "take a stronger pump"
             )
-        start, above = self.start(), self.branch(False)
+        start, above = self.start(), self._branches[False].columns
         begin, stall = 0.0, 0.0
         if start is not None:
             begin = stall = start[1]
