@@ -118,6 +118,27 @@ class VaisalaPtb330Config(Section):
     timeout_s: Timeout = 0.3
 
 
+class Mks937bConfig(Section):
+    """MKS 937B or 946 controller with a capacitance manometer between gas and room."""
+
+    driver: Literal["mks_937b"] = "mks_937b"
+    port: Port
+    baud: Literal[9600, 19_200, 38_400, 57_600, 115_200] = 115_200
+    """Baud rate as set in the controller, which is delivered with 9600. Set both to 115200: 9600 takes 30 ms."""
+    parity: Literal["N", "E", "O"] = "N"
+    """Parity as set in the controller. Set it to E, with the controller, if that offers it."""
+    address: Annotated[int, Field(ge=1, le=253)] = 253
+    """Address as set in the controller. Change it if the controller was set to another."""
+    channel: Annotated[int, Field(ge=1, le=6)] = 1
+    """Channel of the manometer: 1 and 2 are in slot A, 3 and 4 in B, 5 and 6 in C. Set it as plugged in."""
+    range_pa: Annotated[float, Field(gt=0, le=1e7)] | None = None
+    """Full scale of the manometer. Set it to have the limits checked against it."""
+    step_max_pa: Annotated[float, Field(gt=0, le=1e6)] = 50.0
+    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
+    serial: Serial = ""
+    timeout_s: Timeout = 0.1
+
+
 class VentusConfig(Section):
     """Lee / TTP Ventus disc pump."""
 
@@ -216,7 +237,9 @@ DisplacementDriver = Annotated[Optoncdt1420Config | KeyenceDlRs1aConfig | Modbus
 PumpDriver = Annotated[
     BronkhorstModbusConfig | BronkhorstProparConfig | VentusConfig | ModbusMapConfig | ExternalConfig, Driver
 ]
-PressureDriver = Annotated[BronkhorstModbusConfig | BronkhorstProparConfig | ModbusMapConfig | ExternalConfig, Driver]
+PressureDriver = Annotated[
+    BronkhorstModbusConfig | BronkhorstProparConfig | Mks937bConfig | ModbusMapConfig | ExternalConfig, Driver
+]
 BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig | ExternalConfig, Driver]
 ValueDriver = Annotated[ModbusMapConfig | ExternalConfig, Driver]
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from firmware_iface import drivers, role_bench, roles, settings
 from firmware_iface.drivers import bronkhorst, bronkhorst_propar, modbus_map
 from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
+from firmware_iface.drivers.mks_937b import Mks937b
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
@@ -33,6 +34,7 @@ _SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
     settings.KeyenceDlRs1aConfig: KeyenceDlRs1a,
     settings.VaisalaPtb330Config: VaisalaPtb330,
     settings.VentusConfig: Ventus,
+    settings.Mks937bConfig: Mks937b,
 }
 
 

@@ -15,6 +15,7 @@ from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators import (
     bronkhorst,
     keyence_dl_rs1a,
+    mks_937b,
     modbus_server,
     optoncdt1420,
     pump_board,
@@ -120,6 +121,10 @@ class Lab:
                 )
             case settings.VaisalaPtb330Config():
                 return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+            case settings.Mks937bConfig():
+                return mks_937b.Mks937bEmulator(
+                    self._sensor(role), section.baud, section.parity, section.address, section.channel
+                )
             case settings.VentusConfig():
                 return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
             case settings.BronkhorstProparConfig():

@@ -7,7 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_iface.emulators import bronkhorst, keyence_dl_rs1a, modbus_server, optoncdt1420, serial_device, ventus
+from firmware_iface.emulators import (
+    bronkhorst,
+    keyence_dl_rs1a,
+    mks_937b,
+    modbus_server,
+    optoncdt1420,
+    serial_device,
+    ventus,
+)
 from firmware_iface.emulators import vaisala_ptb330 as vaisala
 from firmware_iface.links.serial_port import Receiver, SerialPort
 from firmware_iface.roles import LinkDownError
@@ -97,6 +105,10 @@ class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
 
     def digital(self, displacement_um: float) -> int:
         return super().digital(displacement_um + self.random.gauss(0.0, self._noise_um))
+
+
+class Mks937bEmulator(SerialDevice, mks_937b.Mks937bEmulator):
+    pass
 
 
 class VaisalaPtb330Emulator(SerialDevice, vaisala.VaisalaPtb330Emulator):
