@@ -17,3 +17,6 @@ _.expect  # of a scenario: its tests
 _.failing  # state of an outbox, which tests look at
 _.__init_subclass__  # Python calls it
 _.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
+_.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregularity_rms_um  # numbers of a figure,
+_.pvr_um, _.rotational_pv_um, _.asymmetry_rms_um, _.slope_rms_urad  # written and read by their names
+_.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm

@@ -22,12 +22,15 @@ def measure(
     out: Annotated[Path | None, typer.Option(help="Output folder; SET/result by default.")] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures next to the result.")] = True,
     rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")] = False,
+    nominal_radius_mm: Annotated[
+        float | None, typer.Option(min=1.0, help="Nominal radius of curvature, for the deviation of the power.")
+    ] = None,
     json: JsonOption = False,
 ) -> int:
     """Measure one capture set: height, Zernike coefficients, quality."""
     from membrane_ctrl.measure.measure import measure_command
 
-    return measure_command(capture_set, geometry, out, json, pictures, rerun)
+    return measure_command(capture_set, geometry, out, json, pictures, rerun, nominal_radius_mm)
 
 
 def uncertainty(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.measure import results, sofast
+from membrane_ctrl.measure import figure_results, results, sofast
 from membrane_ctrl.measure.measurement import Measurement, measure_set
 from membrane_ctrl.metrology.frames.series_integrity import SeriesFlag, check_series
 from membrane_ctrl.metrology.optics.geometry import Outline, find_outline
@@ -21,7 +21,13 @@ _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
 
 
 def measure_command(
-    folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool, rerun: bool
+    folder: Path,
+    geometry: Path | None,
+    out: Path | None,
+    as_json: bool,
+    pictures: bool,
+    rerun: bool,
+    nominal_radius_mm: float | None = None,
 ) -> int:
     """Measure one set, write the result and report it. Returns the exit code; raises InputError."""
     if folder.suffix == ".h5":
@@ -33,23 +39,32 @@ def measure_command(
     light, outline = _outline(measurement)
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry)
+    figure = figure_results.measured_figure(measurement, bars, nominal_radius_mm)
+    block = figure_results.figure_table(measurement, figure, bars) if figure and bars else None
+    result, details = (
+        results.result_table(measurement, block),
+        results.details_table(measurement, profile, outline, bars),
+    )
     begin = time.perf_counter()
     with errors.writing(target):
-        results.write_result(target, measurement, results.details_table(measurement, profile, outline, bars), bars)
+        results.write_result(target, measurement, result, details, bars)
+        if figure is not None:
+            figure_results.write_figure_maps(target / "figure.npz", figure)
         drawn: list[Path] = []
         if pictures:
             from membrane_ctrl.measure.pictures import draw_all
 
-            drawn = draw_all(target, measurement, light, profile, outline, bars)
+            drawn = draw_all(target, measurement, light, profile, outline, bars, figure)
         if rerun:
             from membrane_ctrl.measure.pictures import log_measurement
 
             log_measurement(target / "measurement.rrd", measurement, drawn)
     print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
     if as_json:
-        print(json.dumps(results.result_table(measurement)))
+        print(json.dumps(result))
     else:
-        print("\n".join(_lines(measurement, profile, outline, bars)))
+        own = [] if figure is None else figure_results.figure_lines(figure)
+        print("\n".join(_lines(measurement, profile, outline, bars) + own))
     return int(errors.Exit.REJECTED if measurement.verdict == "rejected" else errors.Exit.DONE)
 
 

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 
+from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, write_figure
 from membrane_ctrl.metrology.full import FullResult
@@ -19,6 +21,7 @@ from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
 
 _SHOWN_PX = 600  # side of pixel maps
+_STEEP = 3.0  # largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
 
 
 def draw_all(
@@ -28,6 +31,7 @@ def draw_all(
     profile: surface.RadialProfile | None,
     outline: geometry.Outline | None,
     bars: ErrorBars | None,
+    figure: MeasuredFigure | None,
 ) -> list[Path]:
     """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the fringes' mean."""
     files = [write_figure(out / "frames.png", _frames(measurement))]
@@ -44,7 +48,37 @@ def draw_all(
         write_figure(out / "profile.png", _profile(profile)),
         write_figure(out / "convergence.png", _convergence(full)),
     ]
-    return files if bars is None else [*files, write_figure(out / "uncertainty.png", _uncertainty(bars))]
+    if bars is not None:
+        files.append(write_figure(out / "uncertainty.png", _uncertainty(bars)))
+    if figure is not None:
+        files.append(write_figure(out / "figure.png", _figure(figure)))
+    return files
+
+
+def _figure(found: MeasuredFigure) -> Figure:
+    """Draw what deviates from the best sphere, its spectrum, and the encircled energy."""
+    figure = Figure(figsize=(12, 10), layout="constrained")
+    (whole, rest), (spectrum, energy) = figure.subplots(2, 2)
+    axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
+    radius_mm = found.figure.numbers.radius_of_curvature_mm
+    show_map(whole, f"less the best sphere, R = {radius_mm:.1f} mm (um)", axis, deviation_um, "RdBu_r", even=True)
+    asymmetry_um = deviation_um - found.figure.rotational_um
+    show_map(rest, "and less its rotationally invariant part (um)", axis, asymmetry_um, "RdBu_r", even=True)
+    psd = found.spectrum
+    low = np.maximum(psd.density_um2_mm2 - psd.sigma_um2_mm2, psd.density_um2_mm2 / 10)
+    spectrum.fill_between(psd.frequency_per_mm, low, psd.density_um2_mm2 + psd.sigma_um2_mm2, alpha=0.3)
+    spectrum.loglog(psd.frequency_per_mm, psd.density_um2_mm2)
+    spectrum.set(title="spectral density", xlabel="spatial frequency (1/mm)", ylabel="um^2 mm^2")
+    if found.figure.numbers.best_focus_mm > 0:
+        energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
+        numbers, noise, geometry_part = found.figure.numbers, found.noise.numbers, found.geometry.numbers
+        for name in ("spot_50_mm", "spot_80_mm", "spot_95_mm"):
+            bar = np.nan_to_num(np.hypot(getattr(noise, name), getattr(geometry_part, name)))
+            share = float(name.split("_")[1])
+            energy.errorbar(getattr(numbers, name), share, xerr=bar, fmt="o", capsize=4, color="tab:red")
+        energy.set(title=f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex")
+    energy.set(xlabel="radius (mm)", ylabel="% of the rays", ylim=(0, 101))
+    return figure
 
 
 def _uncertainty(bars: ErrorBars) -> Figure:
@@ -65,15 +99,29 @@ def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: b
 
 
 def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
-    """Draw a map with its colour scale; `even` centres the scale on 0."""
+    """Draw a map with its colour scale.
+
+    `even` centres the scale on 0; a dent far beyond what the rest of the map needs makes it logarithmic out there.
+    """
     low, high = np.nanpercentile(values, [0.5, 99.5])
+    scale: dict[str, Any] = {"vmin": low, "vmax": high}
     if even:
-        high = max(abs(low), abs(high))
-        low = -high
+        high = max(abs(low), abs(high), 1e-12)
+        most = max(high, float(np.nanmax(np.abs(_local_mean(values)))))
+        steep = most > _STEEP * high
+        scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)} if steep else {"vmin": -most, "vmax": most}
+        title += f", linear to +-{high:.2g}" if steep else ""
     extent = (axis[0], axis[-1], axis[0], axis[-1])
-    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high)
+    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, **scale)
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
     axes.figure.colorbar(shown, ax=axes, shrink=0.85)
+
+
+def _local_mean(values: FloatArray) -> FloatArray:
+    """Mean over squares of 3 x 3 cells: a single wild cell does not set a scale."""
+    whole = [size // 3 * 3 for size in values.shape]
+    squares = values[: whole[0], : whole[1]].reshape(whole[0] // 3, 3, whole[1] // 3, 3)
+    return np.asarray(squares.mean(axis=(1, 3)))
 
 
 def _slopes(full: FullResult) -> Figure:

@@ -15,8 +15,8 @@ from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.full import FullResult
+from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, RadialProfile, sag_gradient
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, write_bytes_atomic, write_text_atomic
@@ -37,11 +37,12 @@ class ErrorBars:
     geometry: FloatArray  # from the geometry's covariance; zeros if the poses count as exact
     source: str  # source of that covariance
     grid: monte_carlo.HeightMap  # grid of `maps_um`
+    cell_slope: float = 0.0  # 1 sigma of the mean slope of a cell of the height map, from pixel noise
 
     @property
     def sag_um(self) -> tuple[float, float]:
         """1 sigma of the sag: noise, geometry."""
-        gradient = sag_gradient()
+        gradient = surface.sag_gradient()
         of_noise, of_geometry = (1e3 * float(np.sqrt(gradient @ c @ gradient)) for c in (self.noise, self.geometry))
         return of_noise, of_geometry
 
@@ -74,13 +75,21 @@ def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | N
         )
         of_geometry = monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
     except ArithmeticError:
-        of_geometry, source = np.full((PARAMETERS, PARAMETERS), np.nan), f"{source}: too large to propagate"
+        of_geometry, source = (
+            np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan),
+            f"{source}: too large to propagate",
+        )
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
-    return ErrorBars(bins.parameter_covariance(full.fit, gain @ sigma_mm**2), of_geometry, source, grid)
+    variance = gain @ sigma_mm**2
+    cell_slope = math.sqrt(float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0])))
+    return ErrorBars(bins.parameter_covariance(full.fit, variance), of_geometry, source, grid, cell_slope)
 
 
-def result_table(measurement: Measurement) -> dict[str, Any]:
-    """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null."""
+def result_table(measurement: Measurement, figure: dict[str, Any] | None) -> dict[str, Any]:
+    """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null.
+
+    `figure` is its block of that name (`figure_results.figure_table`).
+    """
     full = measurement.full
     radius_mm = measurement.head.optics.mirror.radius_mm
     coeffs = [None] * 36 if full is None else (1e3 * full.surface.coeffs_mm).tolist()
@@ -106,6 +115,7 @@ def result_table(measurement: Measurement) -> dict[str, Any]:
         "quality": quality,
         "geometry": measurement.head.geometry.table(),
         "timing_s": measurement.timing_s,
+        "figure": figure,
     }
 
 
@@ -122,15 +132,15 @@ def _fit_table(full: FullResult | None) -> dict[str, Any]:
 
 
 def details_table(
-    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+    measurement: Measurement, profile: surface.RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
 ) -> dict[str, Any]:
     """Further results: sag, pressure, zonal residual, noise, the rim in the picture."""
     full = measurement.full
     table: dict[str, Any] = {
         "set": str(measurement.head.folder),
-        "displacement_um": _number(measurement.displacement_um),
+        "displacement_um": number_or_null(measurement.displacement_um),
         "ignored_keys": list(measurement.head.ignored),
-        "noise_seen_adu": _number(noise_seen_adu(measurement)),
+        "noise_seen_adu": number_or_null(noise_seen_adu(measurement)),
     }
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
@@ -147,8 +157,8 @@ def details_table(
     if bars is not None:
         of_noise, of_geometry = bars.sag_um
         table["sag_sigma_um"] = {
-            "noise": _number(of_noise),
-            "geometry": _number(of_geometry),
+            "noise": number_or_null(of_noise),
+            "geometry": number_or_null(of_geometry),
             "geometry_spread": bars.source,
         }
     if outline is not None:
@@ -161,10 +171,12 @@ def details_table(
     return table
 
 
-def write_result(out: Path, measurement: Measurement, details: dict[str, Any], bars: ErrorBars | None) -> None:
+def write_result(
+    out: Path, measurement: Measurement, result: dict[str, Any], details: dict[str, Any], bars: ErrorBars | None
+) -> None:
     """Write `result.json`, `details.json` and, with a usable figure, two maps. Raises OSError."""
     make_folder(out)
-    write_json(out / "result.json", result_table(measurement))
+    write_json(out / "result.json", result)
     write_json(out / "details.json", details)
     if measurement.full is not None and measurement.verdict != "rejected":
         axis = measurement.full.grid.axis_mm
@@ -197,5 +209,5 @@ def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
     return path
 
 
-def _number(value: float) -> float | None:
+def number_or_null(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -8,6 +8,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct, zonal
 from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.figure import SurfaceMap
 from membrane_ctrl.metrology.frames.frame_stack import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
@@ -48,8 +49,13 @@ class FullResult:
 
     def height_mm(self) -> FloatArray:
         """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where not measured."""
-        x, y = np.meshgrid(self.grid.axis_mm, self.grid.axis_mm)
-        return self.surface.height(x, y) + self.residual_mm
+        return np.asarray(self.surface.on_grid(self.grid.axis_mm)[0] + self.residual_mm)
+
+    def map(self) -> SurfaceMap:
+        """The height with the slopes that were measured, as means over the cells."""
+        height, slope_x, slope_y = self.surface.on_grid(self.grid.axis_mm)
+        grid = self.grid
+        return SurfaceMap(grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y)
 
 
 @dataclass(frozen=True)

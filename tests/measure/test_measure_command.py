@@ -61,6 +61,15 @@ def test_a_full_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert result["quality"]["verdict"] == "ok"
     assert result["quality"]["flagged_frames"] == []
     assert set(result["timing_s"]) == {"load", "phase", "reconstruct"}
+    figure = result["figure"]
+    assert set(figure["not_given"]) == {"power_um"}
+    assert figure["numbers"]["radius_of_curvature_mm"]["value"] == pytest.approx(3440, abs=10)
+    for number in figure["numbers"].values():  # the geometry was measured by hand
+        assert 0 < number["sigma_noise"] < number["sigma_geometry"]
+    noll, osa, fringe = figure["zernike"]
+    assert noll["coeffs_um"] == result["zernike"]["coeffs_um"]
+    assert sorted(osa["coeffs_um"]) == sorted(noll["coeffs_um"])
+    assert (len(fringe["coeffs_um"]), fringe["radius_mm"]) == (37, 475.0)
     truth, maps = np.load(made / "0000" / "truth.npz"), np.load(tmp_path / "height.npz")
     x, y = np.meshgrid(maps["x_mm"], maps["y_mm"])
     assert maps["h_mm"].shape == (maps["y_mm"].size, maps["x_mm"].size)
@@ -88,7 +97,17 @@ def test_a_fringes_set_leans_on_its_reference(made: Path, tmp_path: Path) -> Non
 def test_pictures_and_recording(made: Path, tmp_path: Path) -> None:
     assert run(["measure", str(made / "0000"), "--out", str(tmp_path), "--rerun"]) == 0
     names = {path.stem for path in tmp_path.glob("*.png")}
-    assert names == {"frames", "sag", "residual", "slopes", "modulation", "profile", "convergence", "uncertainty"}
+    assert names == {
+        "frames",
+        "sag",
+        "residual",
+        "slopes",
+        "modulation",
+        "profile",
+        "convergence",
+        "uncertainty",
+        "figure",
+    }
     assert (tmp_path / "measurement.rrd").stat().st_size > 10_000
     details = json.loads((tmp_path / "details.json").read_text())
     assert details["hencky_sag_mm"] == pytest.approx(37.1, abs=0.05)

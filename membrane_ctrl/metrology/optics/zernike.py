@@ -7,14 +7,17 @@ Source: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976): even j takes the cosine, od
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
+from numpy.polynomial.legendre import legvander, poly2leg
 
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 TERMS = 36
 DEGREE = 7
+FRINGE_TERMS = 37
 
 
 def noll(j: int) -> tuple[int, int]:
@@ -27,6 +30,24 @@ def noll(j: int) -> tuple[int, int]:
     return n, (m if j % 2 == 0 else -m)
 
 
+def osa_from_noll(per_term: FloatArray) -> FloatArray:
+    """Values (36, ...) per term in the order of OSA/ANSI's index j = 0..35, of the same terms in Noll's order."""
+    orders = [noll(j) for j in range(1, TERMS + 1)]
+    return np.asarray(per_term)[sorted(range(TERMS), key=orders.__getitem__)]
+
+
+def fringe(j: int) -> tuple[int, int]:
+    """Radial and azimuthal order (negative: sine) of the Fringe set's index 1..37; the last is n = 12, m = 0."""
+    if not 1 <= j <= FRINGE_TERMS:
+        raise ValueError(f"the Fringe set has the terms 1 to {FRINGE_TERMS}, got {j}")
+    if j == FRINGE_TERMS:
+        return 12, 0
+    half = math.isqrt(j - 1)  # (n + |m|) / 2
+    place = j - half**2 - 1  # 0 .. 2 half within the shell: m falls, cosine before sine
+    m = half - place // 2
+    return 2 * half - m, (m if place % 2 == 0 else -m)
+
+
 @cache
 def monomial_table() -> FloatArray:
     """Coefficients (36, 8, 8): Z_j = sum over p, q of table[j - 1, p, q] x^p y^q, on the unit disc."""
@@ -36,19 +57,23 @@ def monomial_table() -> FloatArray:
 
 
 def _polynomial(j: int) -> FloatArray:
-    """One term: N R(rho) / rho^m, a polynomial in u = x^2 + y^2, times Re or Im of (x + iy)^m."""
-    n, signed_m = noll(j)
-    m = abs(signed_m)
-    norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
-    out = np.zeros((DEGREE + 1, DEGREE + 1))
-    for k in range((n - m) // 2 + 1):
-        radial = (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, (n - m) // 2 - k)
-        power_u = (n - m) // 2 - k
+    """One of the 36 terms, with unit RMS over the disc."""
+    n, m = noll(j)
+    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * term(n, m, DEGREE)
+
+
+def term(n: int, m: int, degree: int) -> FloatArray:
+    """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1; sine for m < 0."""
+    order = abs(m)
+    out = np.zeros((degree + 1, degree + 1))
+    for k in range((n - order) // 2 + 1):
+        radial = (-1) ** k * math.comb(n - k, k) * math.comb(n - 2 * k, (n - order) // 2 - k)
+        power_u = (n - order) // 2 - k
         for s in range(power_u + 1):  # u^power = sum of binomials x^2s y^2(power - s)
-            for t in range(m + 1):  # (x + iy)^m = sum of binomials x^(m-t) (iy)^t
-                angular = (1j**t).imag if signed_m < 0 else (1j**t).real
-                weight = radial * math.comb(power_u, s) * math.comb(m, t) * angular
-                out[2 * s + m - t, 2 * (power_u - s) + t] += norm * weight
+            for t in range(order + 1):  # (x + iy)^m = sum of binomials x^(m-t) (iy)^t
+                angular = (1j**t).imag if m < 0 else (1j**t).real
+                weight = radial * math.comb(power_u, s) * math.comb(order, t) * angular
+                out[2 * s + order - t, 2 * (power_u - s) + t] += weight
     return out
 
 
@@ -90,3 +115,42 @@ def at_rim() -> FloatArray:
     """Mean over azimuth (36,) of all terms on the rim: only m = 0 is left, with R(1) = 1."""
     orders = [noll(j) for j in range(1, TERMS + 1)]
     return np.array([math.sqrt(n + 1) if m == 0 else 0.0 for n, m in orders])
+
+
+# Terms fitted to a map on a square grid. A grid is a product of its axes: with the terms as sums of T[k, a, b] P_a(x)
+# P_b(y), Legendre's P, every sum over cells is two products of small matrices, without the terms of each cell.
+
+
+class GridFit:
+    """Least squares of terms over the cells of a grid that a mask selects.
+
+    Parameters
+    ----------
+    axis : (n,) array
+        Middle of the cells along x and along y, in radii of the disc.
+    mask : (n, n) bool array
+        Cells to use; rows along y.
+    orders : sequence of (n, m)
+        Terms, without normalisation.
+    """
+
+    def __init__(self, axis: FloatArray, mask: BoolArray, orders: Sequence[tuple[int, int]]) -> None:
+        degree = max(n for n, _ in orders)
+        to_legendre = np.stack([np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))])
+        self._terms = np.stack([to_legendre.T @ term(n, m, degree) @ to_legendre for n, m in orders])
+        self._along = legvander(axis, degree)
+        self._mask = mask
+        pairs = np.einsum("ia,ib->iab", self._along, self._along)
+        moments = np.einsum("iac,ij,jbd->acbd", pairs, mask.astype(float), pairs, optimize=True)
+        self._gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
+
+    def coefficients(self, values: FloatArray) -> FloatArray:
+        """Coefficients (terms,) of a map (n, n); cells outside the mask are not read."""
+        moments = self._along.T @ np.where(self._mask, values, 0.0) @ self._along
+        right = np.einsum("kba,ab->k", self._terms, moments)
+        return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-12)[0])
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Map (n, n) of the terms, also outside the mask."""
+        inner = np.tensordot(coefficients, self._terms, axes=1).T
+        return np.asarray(self._along @ inner @ self._along.T)

@@ -1,0 +1,171 @@
+"""The metrologist's figure of a measurement: its numbers with error bars, its block in `result.json`, its maps."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.measure.measurement import Measurement
+from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
+from membrane_ctrl.metrology.figure import (
+    Figure,
+    FigureBars,
+    FigureOf,
+    PowerSpectrum,
+    SurfaceMap,
+    figure_bars,
+    power_spectrum,
+)
+from membrane_ctrl.metrology.optics import surface, zernike
+
+ENERGY_SHARES = np.linspace(0.01, 1.0, 100)
+
+
+@dataclass(frozen=True)
+class MeasuredFigure:
+    """The metrologist's figure of a measurement, with the error bars of its numbers."""
+
+    figure: Figure
+    noise: FigureBars
+    geometry: FigureBars
+    spectrum: PowerSpectrum
+    seen: SurfaceMap
+    aperture_mm: float
+    nominal_radius_mm: float | None
+
+    @property
+    def power_um(self) -> tuple[float, float, float] | None:
+        """Depth of the best sphere less that of the nominal one, with its two bars; None without a nominal radius."""
+        if self.nominal_radius_mm is None:
+            return None
+        nominal = surface.Sphere(0.0, 0.0, 0.0, 1 / self.nominal_radius_mm).sag_mm(self.aperture_mm)
+        found, *bars = (one.numbers.sphere_sag_mm for one in (self.figure, self.noise, self.geometry))
+        return 1e3 * (found - nominal), 1e3 * bars[0], 1e3 * bars[1]
+
+
+def measured_figure(
+    measurement: Measurement, bars: ErrorBars | None, nominal_radius_mm: float | None = None
+) -> MeasuredFigure | None:
+    """Evaluate the figure of a measurement; None if it has no usable one."""
+    full, mirror = measurement.full, measurement.head.optics.mirror
+    if full is None or bars is None or measurement.verdict == "rejected":
+        return None
+    aperture = mirror.analysis_radius_mm
+    seen = full.map()
+    found = FigureOf(seen, aperture)(seen)
+    of_noise = figure_bars(seen, aperture, mirror.radius_mm, bars.noise, bars.cell_slope)
+    of_geometry = figure_bars(seen, aperture, mirror.radius_mm, bars.geometry)
+    spectrum = power_spectrum(found, seen.axis_mm, aperture)
+    return MeasuredFigure(found, of_noise, of_geometry, spectrum, seen, aperture, nominal_radius_mm)
+
+
+def figure_table(measurement: Measurement, found: MeasuredFigure, bars: ErrorBars) -> dict[str, Any]:
+    """The block `figure`: every number with 1 sigma from noise and from the geometry (docs/figure.md)."""
+    numbers = {
+        name: quantity(value, getattr(found.noise.numbers, name), getattr(found.geometry.numbers, name))
+        for name, value in vars(found.figure.numbers).items()
+    }
+    missing = {name: "a surface that is nearly flat has none" for name, item in numbers.items() if item is None}
+    if found.figure.numbers.best_focus_mm <= 0:  # behind the mirror
+        for name in [name for name in numbers if name.startswith(("best_focus", "spot"))]:
+            numbers[name], missing[name] = None, "the mirror has no real focus"
+    if found.power_um is None:
+        missing["power_um"] = "no nominal radius: give --nominal-radius-mm"
+    else:
+        numbers["power_um"] = quantity(*found.power_um)
+    return {
+        "aperture_radius_mm": found.aperture_mm,
+        "centre_mm": [0.0, 0.0],
+        "cell_mm": measurement.full.grid.step_mm if measurement.full else None,
+        "geometry_spread": bars.source,
+        "numbers": {name: item for name, item in numbers.items() if item is not None},
+        "not_given": missing,
+        "zernike": _zernike_tables(measurement, found, bars),
+    }
+
+
+def quantity(value: float, of_noise: float, of_geometry: float) -> dict[str, float | None] | None:
+    """A number with its error bars, null where there is none; None if the number does not exist."""
+    if not math.isfinite(value):
+        return None
+    return {"value": value, "sigma_noise": number_or_null(of_noise), "sigma_geometry": number_or_null(of_geometry)}
+
+
+def _zernike_tables(measurement: Measurement, found: MeasuredFigure, bars: ErrorBars) -> list[dict[str, Any]]:
+    """The height in three sets of terms; Noll's and OSA's are the same terms, Fringe's are fitted to the map."""
+    radius_mm = measurement.head.optics.mirror.radius_mm
+    to_coeffs = surface.parameter_to_coeffs()
+    coeffs = 1e3 * measurement.full.surface.coeffs_mm if measurement.full else np.full(zernike.TERMS, np.nan)
+    of_noise, of_geometry = (
+        1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ c @ to_coeffs.T), 0.0)) for c in (bars.noise, bars.geometry)
+    )
+    osa = [zernike.osa_from_noll(row) for row in (coeffs, of_noise, of_geometry)]
+    fringe = found.figure.fringe_um, found.noise.fringe_um, found.geometry.fringe_um
+    return [
+        {
+            "index": index,
+            "first": first,
+            "normalisation": normalisation,
+            "radius_mm": radius,
+            "centre_mm": [0.0, 0.0],
+            "coeffs_um": [number_or_null(value) for value in rows[0]],
+            "sigma_noise_um": [number_or_null(value) for value in rows[1]],
+            "sigma_geometry_um": [number_or_null(value) for value in rows[2]],
+        }
+        for index, first, normalisation, radius, rows in (
+            ("noll", 1, "rms", radius_mm, (coeffs, of_noise, of_geometry)),
+            ("osa", 0, "rms", radius_mm, osa),
+            ("fringe", 1, "peak", found.aperture_mm, fringe),
+        )
+    ]
+
+
+def write_figure_maps(path: Path, found: MeasuredFigure) -> None:
+    """Write the deviation from the best sphere, its spectrum, and the encircled energy. Raises OSError."""
+    write_arrays(
+        path,
+        x_mm=found.seen.axis_mm,
+        y_mm=found.seen.axis_mm,
+        deviation_um=found.figure.deviation_um,
+        rotational_um=found.figure.rotational_um,
+        frequency_per_mm=found.spectrum.frequency_per_mm,
+        density_um2_mm2=found.spectrum.density_um2_mm2,
+        density_sigma_um2_mm2=found.spectrum.sigma_um2_mm2,
+        encircled_share=ENERGY_SHARES,
+        encircled_radius_mm=np.quantile(found.figure.spot_mm, ENERGY_SHARES),
+    )
+
+
+def figure_lines(found: MeasuredFigure) -> list[str]:
+    """The numbers as lines of text; +- is 1 sigma of noise and geometry together."""
+    numbers = found.figure.numbers
+
+    def told(name: str, unit: str, scale: float = 1.0) -> str:
+        bars = (getattr(of.numbers, name) for of in (found.noise, found.geometry))
+        return f"{with_bar(scale * getattr(numbers, name), scale * math.hypot(*bars))} {unit}"
+
+    lines = [
+        f"sphere    radius {told('radius_of_curvature_mm', 'mm')}, focal length {told('focal_length_mm', 'mm')}",
+        f"irregular PV {told('irregularity_pv_um', 'um')}, RMS {told('irregularity_rms_um', 'um')}, "
+        f"PVr {told('pvr_um', 'um')}; slope {told('slope_rms_urad', 'urad')} RMS",
+        f"          rotationally invariant PV {told('rotational_pv_um', 'um')}, "
+        f"the rest {told('asymmetry_rms_um', 'um')} RMS",
+    ]
+    if numbers.best_focus_mm > 0:
+        lines.append(
+            f"spot      {told('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "
+            f"{told('spot_80_mm', 'mm')}, 50 % {told('spot_50_mm', 'mm')}, 95 % {told('spot_95_mm', 'mm')} (radius)"
+        )
+    return lines
+
+
+def with_bar(value: float, sigma: float) -> str:
+    """A number with its 1 sigma, to two digits of that; without one the number says so."""
+    if not math.isfinite(sigma):
+        return f"{value:.4g} (no error bar)"
+    if sigma <= 0:
+        return f"{value:.6g}"
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{digits}f} +- {sigma:.{digits}f}"
