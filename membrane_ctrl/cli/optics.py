@@ -9,8 +9,9 @@ from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetA
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `uncertainty`, `stability`, `simulate`."""
+    """Add `measure`, `export-figure`, `uncertainty`, `stability`, `simulate`."""
     app.command()(measure)
+    app.command()(export_figure)
     app.command()(uncertainty)
     app.command()(stability)
     app.command()(simulate)
@@ -31,6 +32,21 @@ def measure(
     from membrane_ctrl.measure.measure import measure_command
 
     return measure_command(capture_set, geometry, out, json, pictures, rerun, nominal_radius_mm)
+
+
+def export_figure(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of `measure`.")],
+    form: Annotated[str, typer.Option("--format", help="zygo-dat, zygo-xyz, codev-int or h5.")],
+    remove: Annotated[
+        str, typer.Option(metavar="LIST", help="Take off piston, tilt, power, sphere; separated by commas.")
+    ] = "",
+    zernike: Annotated[str, typer.Option(help="Also write the terms of this set: noll, osa or fringe.")] = "",
+    out: Annotated[Path | None, typer.Option(help="File to write; RESULT/figure.* by default.")] = None,
+) -> int:
+    """Write a measured height map in the format of another program."""
+    from membrane_ctrl.measure.export_figure import export_command
+
+    return export_command(result, form, remove, zernike, out)
 
 
 def uncertainty(

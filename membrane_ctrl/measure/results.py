@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import math
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +21,7 @@ from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import make_folder, write_bytes_atomic, write_text_atomic
+from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
@@ -197,6 +199,33 @@ def write_arrays(path: Path, **arrays: FloatArray) -> None:
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     write_bytes_atomic(path, file.getvalue())
+
+
+_ARRAYS_BYTES = 100_000_000
+
+
+def read_arrays(path: Path, names: tuple[str, ...], most: int) -> list[FloatArray]:
+    """The named arrays of an untrusted `.npz`, each of 64-bit floats and at most `most` of them.
+
+    Raises OSError, or ValueError if it is not such a file. Nothing larger is allocated.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(path, _ARRAYS_BYTES))) as archive:
+            return [_array(archive, name, most) for name in names]
+    except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path.name} is damaged or lacks an array ({error})") from None
+
+
+def _array(archive: zipfile.ZipFile, name: str, most: int) -> FloatArray:
+    with archive.open(f"{name}.npy") as packed:
+        data = io.BytesIO(packed.read(8 * most + 1024))  # whatever size the archive claims
+    version = np.lib.format.read_magic(data)
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, by_columns, kind = read_header(data)
+    left = data.getbuffer().nbytes - data.tell()
+    if kind != np.dtype("<f8") or math.prod(shape) * kind.itemsize != left:
+        raise ValueError(f"{name} is not an array of at most {most} 64-bit floats")
+    return np.frombuffer(data.read(), np.float64).reshape(shape, order="F" if by_columns else "C")
 
 
 def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
