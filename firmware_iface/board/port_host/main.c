@@ -1,5 +1,6 @@
 /* The board as a program on a PC: Modbus RTU on a pseudo terminal, Modbus TCP on a port of localhost, and the wire to a
- * simulated film (bench_line.h) on another. Prints one line with all three, then runs until it is told to stop. */
+ * simulated film (bench_line.h) to a port that listens. Prints the line's name and the TCP port, then runs until it is
+ * told to stop. */
 #define _GNU_SOURCE
 
 #include <arpa/inet.h>
@@ -37,19 +38,23 @@ static uint64_t clock_us(void)
     return (uint64_t)now.tv_sec * 1000000u + (uint64_t)now.tv_nsec / 1000u;
 }
 
-static int listen_on(uint16_t port, uint16_t *got)
+static struct sockaddr_in localhost(uint16_t port)
 {
-    struct sockaddr_in at = {.sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    const struct sockaddr_in at = {
+        .sin_family = AF_INET, .sin_port = htons(port), .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    return at;
+}
+
+static uint16_t listen_on_any_port(void)
+{
+    struct sockaddr_in at = localhost(0);
     socklen_t length = sizeof at;
-    const int found = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
-    const int yes = 1;
-    if (found < 0 || setsockopt(found, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes) < 0 ||
-        bind(found, (struct sockaddr *)&at, sizeof at) < 0 || listen(found, 4) < 0 ||
-        getsockname(found, (struct sockaddr *)&at, &length) < 0) {
+    listener = socket(AF_INET, SOCK_STREAM | SOCK_NONBLOCK, 0);
+    if (listener < 0 || bind(listener, (struct sockaddr *)&at, sizeof at) < 0 || listen(listener, 4) < 0 ||
+        getsockname(listener, (struct sockaddr *)&at, &length) < 0) {
         give_up("cannot listen on localhost");
     }
-    *got = ntohs(at.sin_port);
-    return found;
+    return ntohs(at.sin_port);
 }
 
 static int net_accept(void)
@@ -113,22 +118,26 @@ static void say_line(int line)
     }
 }
 
-/* The wire to the film: one client at a time. */
 static struct {
-    int listener, connection;
+    int connection; /* to the film; -1 without one */
     uint64_t heard_us, said_us;
     uint32_t pump, vent;
     struct bench_line line;
 } film = {.connection = -1};
 
+static void film_connect(const char *port)
+{
+    const struct sockaddr_in at = localhost((uint16_t)strtoul(port, NULL, 10));
+    film.connection = socket(AF_INET, SOCK_STREAM, 0);
+    if (film.connection < 0 || connect(film.connection, (const struct sockaddr *)&at, sizeof at) < 0 ||
+        fcntl(film.connection, F_SETFL, O_NONBLOCK) < 0) {
+        give_up("no film on this port");
+    }
+}
+
 static void film_hear(uint64_t now_us)
 {
     uint8_t bytes[4096];
-    const int newcomer = accept4(film.listener, NULL, NULL, SOCK_NONBLOCK);
-    if (newcomer >= 0) {
-        close(film.connection);
-        film.connection = newcomer;
-    }
     const ssize_t got = film.connection < 0 ? 0 : recv(film.connection, bytes, sizeof bytes, 0);
     for (ssize_t i = 0; i < got; i++) {
         if (bench_take(&film.line, bytes[i])) {
@@ -189,9 +198,8 @@ int main(int count, char **arguments)
 {
     static uint8_t record[512];
     char name[64];
-    uint16_t port = 0, film_port = 0;
-    if (count != 2) {
-        fprintf(stderr, "usage: board SETTINGS (made by python -m firmware_iface.board_settings)\n");
+    if (count != 2 && count != 3) {
+        fprintf(stderr, "usage: board SETTINGS [FILM_PORT] (settings: python -m firmware_iface.board_settings)\n");
         return 2;
     }
     FILE *file = fopen(arguments[1], "rb");
@@ -202,12 +210,14 @@ int main(int count, char **arguments)
     fclose(file);
     signal(SIGTERM, stop);
     signal(SIGINT, stop);
-    listener = listen_on(0, &port);
-    film.listener = listen_on(0, &film_port);
+    const uint16_t port = listen_on_any_port();
+    if (count == 3) {
+        film_connect(arguments[2]);
+    }
     const int line = open_line(name, sizeof name);
     tcp_start();
     virtual_power_on(record, length);
-    printf("rtu %s tcp %u film %u\n", name, port, film_port);
+    printf("rtu %s tcp %u\n", name, port);
     fflush(stdout);
     run(line);
     return 0;

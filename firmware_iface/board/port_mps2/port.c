@@ -67,7 +67,8 @@ static struct {
     bool heard;
 } film;
 
-extern const uint8_t stored_settings[], stored_settings_end[];
+extern const uint8_t stored_settings[];
+extern const uint32_t stored_settings_length;
 
 static bool ring_put(struct ring *ring, uint8_t byte)
 {
@@ -113,7 +114,7 @@ void hal_init(void)
 
 const uint8_t *hal_settings(size_t *length)
 {
-    *length = (size_t)(stored_settings_end - stored_settings);
+    *length = stored_settings_length;
     return stored_settings;
 }
 

@@ -1,7 +1,9 @@
 /* The record of settings, as a flash page of its own would hold it. */
 .section .settings, "a"
 .global stored_settings
-.global stored_settings_end
+.global stored_settings_length
 stored_settings:
 .incbin SETTINGS
-stored_settings_end:
+.balign 4
+stored_settings_length:
+.word stored_settings_length - stored_settings
