@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: hold test rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
+.PHONY: hold test board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test
 
 $(STAMP): pyproject.toml requirements.lock
@@ -67,6 +67,23 @@ campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs
 
 mutants: $(STAMP)  ## code made wrong on purpose: what the fast tests notice, and what the campaign alone; under an hour
 	$(BIN)/python tests/mutants/mutants.py
+
+BOARD := $(MAKE) --no-print-directory -C firmware_iface/board PYTHON=$(CURDIR)/$(BIN)/python OUT=$(CURDIR)/build/board
+
+board: $(STAMP)  ## the pump board's firmware: analysed, built, tested on the host and in QEMU, fuzzed; installs its tools
+	$(BOARD) tools
+	$(BOARD) check all
+	rm -rf build/board/covered
+	BOARD_BUILD=$(CURDIR)/build/board/covered EXTRA=--coverage $(BIN)/pytest tests/board -m "campaign or not campaign"
+	gcovr --root firmware_iface/board --filter firmware_iface/board/core --fail-under-line 95 build/board/covered
+	$(BOARD) fuzz RUNS=20000
+
+board-fuzz: $(STAMP)  ## ten million mutated frames into the firmware; some minutes
+	$(BOARD) tools fuzz RUNS=1000000
+
+board-hold: $(STAMP)  ## the twin's film held for ten minutes by the firmware in QEMU, then by the Python board
+	$(BOARD) tools
+	BOARD_HOLD_S=600 $(BIN)/pytest -rP tests/board/test_board_hold.py
 
 fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (20 minutes)
 	$(BIN)/python tests/fuzz/fuzz_folders.py

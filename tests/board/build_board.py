@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,7 +13,11 @@ FIRMWARE = Path(__file__).parents[2] / "firmware_iface" / "board"
 
 
 def built(target: str, folder: Path, *tools: str) -> Path:
-    """Build a target of the firmware's Makefile in a folder; skip the test where a tool is missing."""
+    """Build a target of the firmware's Makefile in a folder; skip the test where a tool is missing.
+
+    BOARD_BUILD names another folder, whose content is kept (`make board` measures the coverage there).
+    """
+    folder = Path(os.environ.get("BOARD_BUILD", folder))
     for tool in ("make", *tools):
         if shutil.which(tool) is None:
             pytest.skip(f"no {tool} on this machine: `make board` installs it")

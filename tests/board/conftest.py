@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -13,9 +12,8 @@ from tests.board.virtual_board import VirtualBoard
 
 @pytest.fixture(scope="session")
 def firmware_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The firmware with its hardware in memory; BOARD_LIBRARY names one built to measure coverage."""
-    given = os.environ.get("BOARD_LIBRARY")
-    return Path(given) if given else built("libboard.so", tmp_path_factory.mktemp("board"), "cc")
+    """The firmware with its hardware in memory."""
+    return built("libboard.so", tmp_path_factory.mktemp("board"), "cc")
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from firmware_iface.emulators.pump_board import BoardPlant
 from firmware_iface.register_map import default_map
 from tests.board.virtual_board import NO_VALUE
 
-_PERIOD_S = 0.005
+_PERIOD_S = 0.01  # the age that a sample may have
 
 
 class FilmWire:

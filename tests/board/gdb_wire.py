@@ -17,18 +17,33 @@ class StoppedBoard:
         self._reader = reader
         self._writer = writer
 
+    async def _packet(self) -> str:
+        async with asyncio.timeout(_PATIENCE_S):
+            await self._reader.readuntil(b"$")
+            packet = (await self._reader.readuntil(b"#"))[:-1].decode()
+            await self._reader.readexactly(2)
+        self._writer.write(b"+")
+        return packet
+
+    def _say(self, packet: str) -> None:
+        self._writer.write(f"${packet}#{sum(packet.encode()) % 256:02x}".encode())
+
     async def ask(self, packet: str) -> str:
         """The answer to a packet."""
-        self._writer.write(f"${packet}#{sum(packet.encode()) % 256:02x}".encode())
-        async with asyncio.timeout(_PATIENCE_S):
-            answer = "T"
-            while answer.startswith("T"):  # that it stopped, which nobody asked
-                await self._reader.readuntil(b"$")
-                answer = (await self._reader.readuntil(b"#"))[:-1].decode()
-                await self._reader.readexactly(2)
-                self._writer.write(b"+")
-        assert answer and not answer.startswith("E"), f"{packet}: {answer!r}"
+        self._say(packet)
+        while (answer := await self._packet()).startswith("T"):
+            continue  # that it stopped, which nobody asked
+        assert answer, f"QEMU does not know {packet}"
+        assert not answer.startswith("E"), f"{packet}: {answer}"
         return answer
+
+    async def run_to(self, address: int) -> None:
+        """Let it run until it comes to an address."""
+        await self.ask(f"Z0,{address:x},2")
+        self._say("c")
+        while not (await self._packet()).startswith("T05"):
+            continue
+        await self.ask(f"z0,{address:x},2")
 
     async def read(self, address: int, count: int) -> bytes:
         """Bytes of memory."""

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import subprocess
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,12 @@ _START_S = 30.0  # of a busy machine
 def built_image(folder: Path) -> Path:
     """The image for QEMU; skips the test where compiler or emulator are missing."""
     return built("mps2.elf", folder, "arm-none-eabi-gcc", "qemu-system-arm")
+
+
+def addresses(image: Path) -> dict[str, int]:
+    """Addresses of functions and variables in the image."""
+    listing = subprocess.run(["arm-none-eabi-nm", str(image)], check=True, capture_output=True, text=True).stdout
+    return {row.split()[2]: int(row.split()[0], 16) for row in listing.splitlines() if len(row.split()) == 3}
 
 
 @dataclass
@@ -43,10 +50,6 @@ class QemuBoard:
             if "return" in found or "error" in found:
                 return found["return"]
             self.resets += [found] if found.get("event") == "RESET" else []
-
-    async def human(self, command: str) -> str:
-        """A command of QEMU's monitor for people."""
-        return str(await self.monitor("human-monitor-command", **{"command-line": command}))
 
 
 @contextlib.asynccontextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,3 +55,29 @@ def test_the_host_program_names_what_is_wrong(host_program: Path, tmp_path: Path
     found = subprocess.run([str(host_program), str(missing)], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stdout) == (4, "")
     assert "none.bin: No such file" in found.stderr
+
+
+def _tcp(host_board: dict[str, str]) -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", int(host_board["tcp"])), timeout=10)
+    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return client
+
+
+@pytest.mark.real_time
+def test_tcp_clients_of_every_kind(host_board: dict[str, str]) -> None:
+    ask = bytes.fromhex("000700000006010300000001")
+    answer = bytes.fromhex("0007000000050103024d42")
+    clients = [_tcp(host_board) for _ in range(5)]  # one more than the board serves
+    for client in clients[1:]:
+        client.sendall(ask + ask[:5])
+        assert client.recv(64) == answer
+        client.sendall(ask[5:])
+        assert client.recv(64) == answer
+    assert clients[0].recv(64) == b""  # the longest idle made place
+    clients[1].sendall(bytes.fromhex("000800000006090300000001"))
+    assert clients[1].recv(64) == bytes.fromhex("00080000000309830b")
+    for client, junk in zip(clients[2:], ("47455420", "00010000ffff01", "000100000001010000"), strict=True):
+        client.sendall(bytes.fromhex(junk).ljust(7, b"\r"))
+        assert client.recv(64) == b""
+    for client in clients:
+        client.close()

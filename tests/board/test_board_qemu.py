@@ -5,24 +5,22 @@ The emulator has no brown-out and no real time: docs/board.md has the times, and
 
 from __future__ import annotations
 
-import asyncio
 import math
 import os
-import subprocess
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from firmware_iface.conformance import examine
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.roles import BenchCommand, LinkDownError, LinkError
 from tests.board.film_wire import FilmWire
 from tests.board.gdb_wire import StoppedBoard, stopped
-from tests.board.qemu_board import QemuBoard, built_image, qemu_board
+from tests.board.qemu_board import QemuBoard, addresses, built_image, qemu_board
+from tests.board.still_film import StillFilm
 
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time]
 
@@ -33,38 +31,8 @@ _STACK_POINTER = 13
 
 
 @dataclass
-class _Film:
-    """A still film that notes when the pump stops."""
-
-    gauge_pressure_pa: float = 100.0
-    pump: float = 0.0
-    vent: float = 0.0
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
-
-    def sample(self) -> BoardSample:
-        return BoardSample(12.5, 0, self.gauge_pressure_pa, 101_325.0, 21.0, 22.0, 0, 0.0)
-
-    def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
-        self.pump, self.vent = pump_fraction, vent_fraction
-        self.changed.set()
-
-    async def until(self, right: Callable[[], bool]) -> float:
-        """Wait for outputs; the seconds that it took."""
-        start_s = time.monotonic()
-        async with asyncio.timeout(_PATIENCE_S):
-            while not right():
-                self.changed.clear()
-                await self.changed.wait()
-        return time.monotonic() - start_s
-
-    @property
-    def safe(self) -> bool:
-        return self.pump == 0
-
-
-@dataclass
 class _Rig:
-    film: _Film
+    film: StillFilm
     board: QemuBoard
     gdb: Path
     symbols: dict[str, int]
@@ -85,16 +53,14 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def symbols(image: Path) -> dict[str, int]:
-    """Addresses in the image."""
-    listing = subprocess.run(["arm-none-eabi-nm", str(image)], check=True, capture_output=True, text=True).stdout
-    return {row.split()[2]: int(row.split()[0], 16) for row in listing.splitlines() if len(row.split()) == 3}
+    return addresses(image)
 
 
 @pytest.fixture
 async def rig(
     request: pytest.FixtureRequest, image: Path, symbols: dict[str, int], tmp_path: Path
 ) -> AsyncIterator[_Rig]:
-    film = _Film()
+    film = StillFilm()
     wire = FilmWire(film, enable_s=getattr(request, "param", math.inf))
     await wire.start()
     gdb = tmp_path / "gdb"

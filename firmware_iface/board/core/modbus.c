@@ -1,5 +1,7 @@
 #include "modbus.h"
 
+#include <string.h>
+
 #include "board.h"
 
 #define READ_HOLDING 3u
@@ -71,9 +73,8 @@ static enum board_answer write_single(const uint8_t *request, size_t length, uin
     }
     const uint16_t word = word_of(&request[3]);
     const enum board_answer result = board_write(word_of(&request[1]), 1u, &word);
-    for (*said = 1u; *said < length; (*said)++) {
-        answer[*said] = request[*said];
-    }
+    (void)memcpy(&answer[1], &request[1], 4u);
+    *said = 5u;
     return result;
 }
 
@@ -83,9 +84,8 @@ static enum board_answer write_multiple(const uint8_t *request, size_t length, u
     enum board_answer result = take_words(&request[1], length - 1u, WRITE_MAX, words);
     if (result == BOARD_DONE) {
         result = board_write(word_of(&request[1]), word_of(&request[3]), words);
-        for (*said = 1u; *said < 5u; (*said)++) {
-            answer[*said] = request[*said];
-        }
+        (void)memcpy(&answer[1], &request[1], 4u);
+        *said = 5u;
     }
     return result;
 }

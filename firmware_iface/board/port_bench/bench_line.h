@@ -12,7 +12,7 @@
 
 #include "hal.h"
 
-#define BENCH_STALE_US 100000u /* without a line for so long no channel has a value */
+#define BENCH_STALE_US 500000u /* without a line for so long no channel has a value; a busy PC may pause the film */
 #define BENCH_SAID_MAX 24u
 
 struct bench_line {

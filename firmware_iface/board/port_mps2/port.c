@@ -25,7 +25,7 @@
 #define WATCHDOG_KEY 0x1ACCE551u
 #define WATCHDOG_WARNS_AND_RESETS 3u
 /* Longer than hal.h allows on hardware: a busy PC takes the processor away from the emulator for as long. */
-#define WATCHDOG_MS 250u
+#define WATCHDOG_MS 500u
 
 #define NVIC_ISER WORD(0xE000E100u)
 #define NVIC_PRIORITY_0 WORD(0xE000E400u)
