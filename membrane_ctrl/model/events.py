@@ -1,9 +1,10 @@
-"""Events of the controller, one class per kind; `run_events` has those of the processes around it.
+"""Events of the controller, one class per kind, and the sentence on any event; `run_events` has the other kinds.
 
 As JSON they are the lines of `events.jsonl`, without their times. A field is a key of the line (`from_` is "from", a
 Python keyword). Keys with None as default are omitted if None.
 """
 
+import re
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, ClassVar, dataclass_transform
 
@@ -131,3 +132,99 @@ class MaintenanceOver(Event, kind="maintenance_over"):
 
     name: str
     message: str
+
+
+# Events as sentences for people: what happened, where, and what to do; one wording for every timeline.
+
+# A part in brackets is left out if one of its fields is empty.
+_SENTENCES = {
+    "start": "Run started[ on {devices}][, {priority} priority][; {message}]",
+    "end": "Run ended: {exit}",
+    "state": "State {state}[, from {from}][: {why}]",
+    "why": "{why}",
+    "fault": "Fault {name}: {cause}[ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level {rung}]",
+    "cleared": "Fault {name} is over: its cause has gone",
+    "resumed": "Fault {name} is cleared by the resume rule",
+    "shape": "Shape loop {state}[: {reason}]",
+    "command": 'Command {command}[ {value:g} {unit}][ "{text}"][ by {who}][: {why}][. Refused: {refused}]',
+    "gains_reverted": "Gains on trial are reverted: {why}",
+    "experiment": "Experiment {experiment} ended[: {reason}]",
+    "plausibility": "Laser and camera disagree ({seen}). Do: check the laser's mount, the camera and the screen",
+    "agreement": "Laser and camera agree again[ ({seen})]",
+    "maintenance": "Maintenance {name}: {message}",
+    "maintenance_over": "Maintenance {name} is over: {message}",
+    "link": "Link to the pump board: {message}",
+    "latch_written": "The latched fault's file is written again",
+    "child_ended": "The {child} process ended[ with exit code {exit_code}]; the hold continues",
+    "child_silent": "The {child} process does not answer; the hold continues",
+    "child_restarted": "The {child} process was replaced (replacement {restarts})",
+    "child_given_up": "The {child} process ended too often and is not replaced for an hour. Do: check the run",
+    "acquisition": "Acquisition {state}[: {message}]",
+    "geometry": "Geometry {hash}[ from {file}][, calibrated {calibrated_utc}][; {message}]",
+    "capture": "Capture[ of cycle {cycle}][ in {set}][, {verdict}][: {reason}][. Failed: {failed}]",
+    "recorder_error": "Not recorded: {message}. Do: check the disk and the folder of the run",
+    "disk_low": "Disk almost full: {message}",
+    "port": "Control port open[ on {socket}][, TLS {tls}][, metrics {metrics}]",
+    "port_failed": "Control port {port} failed: {message}[. Tries again in {again_s:g} s]",
+    "port_open": "Control port {port} works again",
+    "commander": "Command of the mirror[ taken by {who}][, left by {former}][: {why}]",
+    "refused": "Refused {command} of {who}: {reason}",
+    "alarms_acknowledged": "Alarms acknowledged by {who}[: {why}]",
+    "alarm": "Alarm {alarm}[ to {to}]: {text}",
+    "mark": "Mark[ by {who}]: {text}",
+}
+_UNITS = {"setpoint": "um", "manual": "um/s", "gains": "s on trial"}  # of a command's value
+_PART = re.compile(r"\[([^\]]*)\]")
+_FIELD = re.compile(r"{(\w+)")
+_NOT_TOLD = frozenset({"time_utc", "mono_s", "kind", "crc32"})
+
+_ERRORS = frozenset({"fault", "recorder_error", "unreadable_event", "latch_failed", "child_given_up"})
+_WARNINGS = frozenset({
+    "disk_low", "plausibility", "maintenance", "gains_reverted", "inputs_not_recorded", "shape_unreadable",
+    "child_ended", "child_silent", "port_failed", "refused", "no_claim", "raw_frames",
+})  # fmt: skip
+
+
+def sentence(line: EventLine) -> str:
+    """One sentence on an event, with the remedy if there is one; never raises.
+
+    An event of an unknown kind, or without what its sentence needs, gives its message or else its fields.
+    """
+    kind = _kind(line)
+    fields = {key: value for key, value in line.items() if key not in _NOT_TOLD and value not in (None, "")}
+    unit = _UNITS.get(str(line.get("command")))
+    named = fields | ({"unit": unit} if unit else {})
+    form = _PART.sub(lambda part: part[1] if _there(part[1], named) else "", _SENTENCES.get(kind, "{message}"))
+    if _there(form, named):
+        try:
+            words = for_people(form.format_map(named))
+        except (ValueError, TypeError):  # a number that is none
+            pass
+        else:
+            return words[:1].upper() + words[1:]
+    details = [
+        f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}" for key, value in fields.items()
+    ]
+    return for_people(f"{kind}: {', '.join(details)}" if details else kind)
+
+
+def _kind(line: EventLine) -> str:
+    return "agreement" if line.get("liar") == "nobody" else str(line.get("kind", "?"))
+
+
+def _there(form: str, fields: EventLine) -> bool:
+    return set(_FIELD.findall(form)) <= set(fields)
+
+
+def level(line: EventLine) -> str:
+    """ERROR: the run is affected; WARN: somebody should look at it; otherwise INFO."""
+    kind, word = _kind(line), line.get("state")
+    if kind in _ERRORS or (kind == "acquisition" and word == "failed"):
+        return "ERROR"
+    lost = (kind == "link" and line.get("up") is False) or (kind == "acquisition" and word == "retrying")
+    return "WARN" if lost or kind in _WARNINGS or line.get("refused") else "INFO"
+
+
+def for_people(text: str) -> str:
+    """A text of ours as people read it: `µm` for `um`, `±` for `+-`, in one line."""
+    return " ".join(re.sub(r"\bu(m|rad)\b", r"µ\1", text).replace("+-", "±").split())

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.event_words import for_people
+from membrane_ctrl.model.events import for_people
 from membrane_ctrl.model.run_status import RunStatus, gains_words
 from membrane_ctrl.run_files import shapes, streams
 

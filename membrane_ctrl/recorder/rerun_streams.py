@@ -7,9 +7,9 @@ import numpy as np
 import rerun as rr
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import event_words, shape_estimate, telemetry
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray
-from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.events import EventLine, for_people, level, sentence
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
 
@@ -25,8 +25,8 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
         return
     time_s = np.array([float(event.get("mono_s") or 0.0) for event in events])
     # the log's own column of times is too narrow to read
-    texts = [f"{str(event.get('time_utc', ''))[11:19]} {event_words.sentence(event)}".strip() for event in events]
-    levels = [event_words.level(event) for event in events]
+    texts = [f"{str(event.get('time_utc', ''))[11:19]} {sentence(event)}".strip() for event in events]
+    levels = [level(event) for event in events]
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
     for stream, marks_s, values in streams.mark_lines(events):
         recording.scalars(stream.path, marks_s, values)
@@ -265,7 +265,7 @@ def _legend(
     return (
         f"| map | colours |\n|---|---|\n{rows}\n\n"
         "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of a map is in its range.\n\n"
-        f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{event_words.for_people(reason)}\n"
+        f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{for_people(reason)}\n"
         f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
         f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} µm from noise{geometry}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} µrad, {100 * estimate.valid_fraction:.1f} % valid\n"

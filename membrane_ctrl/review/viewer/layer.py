@@ -12,9 +12,8 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from membrane_ctrl.model import event_words, run_status
+from membrane_ctrl.model import events, run_status
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
-from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
 from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
@@ -163,10 +162,10 @@ class Layer:
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
-        told = [e for e in run.log if not isinstance(e.event, Why) and part_s[0] <= e.mono_s <= part_s[1]]
+        told = [e for e in run.log if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]]
         if told:
-            levels = [event_words.level(each.line) for each in told]
-            texts = [event_words.sentence(each.line) for each in told]
+            levels = [events.level(each.line) for each in told]
+            texts = [events.sentence(each.line) for each in told]
             self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
         for stream, time_s, values in streams.mark_lines([{**each.line, "mono_s": each.mono_s} for each in run.log]):
             self._style(stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True)
@@ -302,12 +301,12 @@ def _summary_page(run: Run) -> str:
         page = summary_page(run.summary or {}, status, run.config)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
         page = "`summary.json` is missing, damaged or of an earlier version.\n"
-    name = event_words.for_people(run.name)
+    name = events.for_people(run.name)
     return f"**{name}**\n\n{page}\nIntervals and spectra: `membrane-ctrl report {name}`\n"
 
 
 def _size(size: float, unit: str) -> str:
-    return event_words.for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
+    return events.for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
 
 
 def _variances(cycles: shapes.Shapes) -> Column:

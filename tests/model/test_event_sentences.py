@@ -6,9 +6,8 @@ from dataclasses import fields
 
 import pytest
 
-from membrane_ctrl.model import event_words
-from membrane_ctrl.model.event_words import level, sentence
-from membrane_ctrl.model.events import KINDS, EventLine
+from membrane_ctrl.model import events
+from membrane_ctrl.model.events import KINDS, EventLine, level, sentence
 
 FAULT = {
     "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 um",
@@ -59,15 +58,15 @@ def test_an_event_is_a_sentence(line: EventLine, said: str) -> None:
 
 
 def test_every_sentence_is_of_a_kind_and_uses_its_keys() -> None:
-    for kind, form in event_words._SENTENCES.items():
+    for kind, form in events._SENTENCES.items():
         known = KINDS["plausibility" if kind == "agreement" else kind]
         keys = {key for _, key in known.keys} | {"unit"}
-        assert set(event_words._FIELD.findall(form)) <= keys, kind
+        assert set(events._FIELD.findall(form)) <= keys, kind
 
 
 def test_every_kind_without_a_sentence_has_a_message() -> None:
     silent = {kind for kind, cls in KINDS.items() if "message" not in {field.name for field in fields(cls)}}
-    assert silent - set(event_words._SENTENCES) <= {"alive", "recorder_done"}  # never in a run's events
+    assert silent - set(events._SENTENCES) <= {"alive", "recorder_done"}  # never in a run's events
 
 
 @pytest.mark.parametrize(
