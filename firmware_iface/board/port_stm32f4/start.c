@@ -1,0 +1,69 @@
+/* Reset, vectors and faults (PM0214 2.3.4; RM0390 table 38). */
+#include "stm32f4.h"
+
+#define MPU_CTRL WORD(0xE000ED94u) /* PM0214 4.2 */
+#define MPU_RBAR WORD(0xE000ED9Cu)
+#define MPU_RASR WORD(0xE000EDA0u)
+#define MPU_ON_BESIDE_DEFAULT 5u           /* PRIVDEFENA, ENABLE: what no region covers is as without an MPU */
+#define MPU_NO_ACCESS_32_BYTES 0x10000009u /* XN, AP 000, size 2^(4+1), on */
+
+extern uint32_t data_start[], data_end[], bss_start[], bss_end[], interrupt_stack_top[], main_stack_top[];
+extern const uint32_t data_stored[];
+extern uint32_t main_stack_guard[];
+
+int main(void);
+void start(void);
+
+/* Any fault, a falling supply (PVD), a failed crystal (NMI), any interrupt that nobody expects: safe, then a reset. */
+static void fault(void)
+{
+    stm32_outputs_safe();
+    AIRCR = AIRCR_RESET;
+    for (;;) {
+    }
+}
+
+static void prepare(void)
+{
+    const uint32_t *from = data_stored;
+    for (uint32_t *to = data_start; to < data_end; to++) {
+        *to = *from;
+        from++;
+    }
+    for (uint32_t *to = bss_start; to < bss_end; to++) {
+        *to = 0u;
+    }
+    MPU_RBAR = (uint32_t)main_stack_guard | 0x10u; /* region 0 */
+    MPU_RASR = MPU_NO_ACCESS_32_BYTES;
+    MPU_CTRL = MPU_ON_BESIDE_DEFAULT;
+    __asm volatile("dsb\n isb" ::: "memory");
+    (void)main();
+    fault();
+}
+
+/* The main loop gets its own stack, so that handlers still have theirs when it overflows. */
+__attribute__((naked)) void start(void)
+{
+    __asm volatile("ldr r0, =main_stack_top\n"
+                   "msr psp, r0\n"
+                   "movs r0, #2\n"
+                   "msr control, r0\n"
+                   "isb\n"
+                   "bl %0\n" ::"i"(prepare));
+}
+
+union vector {
+    uint32_t *stack;
+    void (*handler)(void);
+};
+
+#define F {.handler = fault}
+#define F8 F, F, F, F, F, F, F, F
+#define H(name) {.handler = name}
+
+__attribute__((section(".vectors"), used)) static const union vector VECTORS[16 + 104] = {
+    {.stack = interrupt_stack_top}, H(start), F, F, F, F, F, F,
+    F, F, F, F, F, F, F, H(stm32_tick),
+    F8, F8, F8, F8, F, F, F, F, F, H(stm32_usart1), H(stm32_usart2), F, /* interrupts 0..39 */
+    F8, F8, F8, F8, F8, F8, F8, F8,
+};
