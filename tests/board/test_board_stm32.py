@@ -229,8 +229,10 @@ def test_values_are_averaged_between_samples(laser: Laser) -> None:
 
 
 def test_the_counter_wraps(laser: Laser) -> None:
-    laser.take(frames(65_520, 2**18 - 2, 4))
+    laser.take(frames(65_520, 2**18 - 2, 2))
     assert laser.sample() == (16 * 65_520, 0)
+    laser.take(frames(400, 0, 1))
+    assert laser.sample() == (16 * 400, 0)
 
 
 def test_no_peak_is_an_error_code_and_no_value(laser: Laser) -> None:

@@ -17,7 +17,6 @@ static struct {
     uint32_t sum, count; /* of good distances since the last sample */
     uint32_t heard_us;
     int32_t newest, quality;
-    bool heard;
 } laser = {.part = 6u, .newest = HAL_NO_VALUE, .quality = 1};
 
 static void measured(uint32_t now_us)
@@ -26,7 +25,6 @@ static void measured(uint32_t now_us)
     const bool next = counter == ((laser.counter + 1u) & COUNTS);
     laser.counter = counter;
     if (next) {
-        laser.heard = true;
         laser.heard_us = now_us;
         if (laser.words[0] > RAW_MAX) {
             laser.quality = (laser.words[0] > ERRORS_BELOW) ? (int32_t)(laser.words[0] - ERRORS_BELOW) : 1;
@@ -68,9 +66,8 @@ int32_t laser_displacement(uint32_t now_us)
         laser.sum = 0u;
         laser.count = 0u;
     }
-    if (!laser.heard || ((now_us - laser.heard_us) > STALE_US)) {
-        laser.heard = false;
-        laser.quality = 1;
+    if ((now_us - laser.heard_us) > STALE_US) {
+        laser.quality = 1; /* until a value comes, also when the clock wraps */
     }
     const int32_t found = (laser.quality == 0) ? laser.newest : HAL_NO_VALUE;
     hal_unlock(before);
