@@ -12,7 +12,7 @@
 #define ENABLE_PIN 0x0020u
 #define LOW(pins) ((pins) << 16)
 
-/* LSI has 17..47 kHz (DS10693 table 42): 400 clocks of LSI / 4 are 34..94 ms, below HAL_WATCHDOG_MAX_MS. */
+/* LSI has 17..47 kHz (data sheet DS10693): 400 clocks of LSI / 4 are 34..94 ms, below HAL_WATCHDOG_MAX_MS. */
 #define WATCHDOG_RELOAD 400u
 
 /* 84 MHz / 4200 = 20 kHz, with 4200 steps */
