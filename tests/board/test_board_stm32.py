@@ -65,7 +65,7 @@ class Stm32:
     async def drives(self, pump: int, vent: int) -> None:
         """Wait until the outputs have these compare values: they follow with the next tick of a busy emulator."""
         async with asyncio.timeout(START_S):
-            while (await self.word(CCR1), await self.word(CCR2)) != (pump, vent):
+            while (await self.word(CCR1), await self.word(CCR2)) != (pump, vent):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
 
