@@ -1,26 +1,32 @@
 """Pictures of a measurement, as PNG files beside the result."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, write_figure
+from membrane_ctrl.metrology.figure import SurfaceMap
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics import geometry, surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
 
+if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
+    import rerun as rr
+    import rerun.blueprint as rrb
+
 _SHOWN_PX = 600  # side of pixel maps
+_MAP_CELLS = 450
 _STEEP = 3.0  # largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
 
 
@@ -43,7 +49,7 @@ def draw_all(
     files += [
         write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
         write_figure(out / "residual.png", _map("height over the fit (um)", axis, residual_um, "RdBu_r", even=True)),
-        write_figure(out / "slopes.png", _slopes(full)),
+        write_figure(out / "slopes.png", _slopes(full, full.map() if figure is None else figure.seen)),
         write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
         write_figure(out / "profile.png", _profile(profile)),
         write_figure(out / "convergence.png", _convergence(full)),
@@ -55,10 +61,18 @@ def draw_all(
     return files
 
 
+def sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
+    """A figure of so many inches and its axes, with fixed margins: fitted ones double the time of a picture."""
+    figure = Figure(figsize=(width, height))
+    axes = figure.subplots(rows, columns)
+    left, right, low, high = 0.8 / width, 1 - 0.35 / width, 0.6 / height, 1 - 0.4 / height
+    figure.subplots_adjust(left=left, right=right, bottom=low, top=high, wspace=0.25, hspace=0.28)
+    return figure, axes
+
+
 def _figure(found: MeasuredFigure) -> Figure:
     """Draw what deviates from the best sphere, its spectrum, and the encircled energy."""
-    figure = Figure(figsize=(12, 10), layout="constrained")
-    (whole, rest), (spectrum, energy) = figure.subplots(2, 2)
+    figure, ((whole, rest), (spectrum, energy)) = sheet(12, 10, 2, 2)
     axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
     radius_mm = found.figure.numbers.radius_of_curvature_mm
     show_map(whole, f"less the best sphere, R = {radius_mm:.1f} mm (um)", axis, deviation_um, "RdBu_r", even=True)
@@ -83,9 +97,8 @@ def _figure(found: MeasuredFigure) -> Figure:
 
 def _uncertainty(bars: ErrorBars) -> Figure:
     """Draw 1 sigma from noise and, if known, from the geometry."""
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    figure, (left, right) = sheet(12, 4.8, 1, 2)
     of_noise, of_geometry = bars.maps_um()
-    left, right = figure.subplots(1, 2)
     show_map(left, "1 sigma from pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
     if np.isfinite(of_geometry).any():
         show_map(right, "1 sigma from the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
@@ -93,8 +106,8 @@ def _uncertainty(bars: ErrorBars) -> Figure:
 
 
 def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> Figure:
-    figure = Figure(figsize=(6.4, 5.4), layout="constrained")
-    show_map(figure.subplots(), title, axis, values, colours, even)
+    figure, axes = sheet(6.4, 5.4)
+    show_map(axes, title, axis, values, colours, even)
     return figure
 
 
@@ -112,7 +125,10 @@ def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colour
         scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)} if steep else {"vmin": -most, "vmax": most}
         title += f", linear to +-{high:.2g}" if steep else ""
     extent = (axis[0], axis[-1], axis[0], axis[-1])
-    shown = axes.imshow(values, origin="lower", extent=extent, cmap=colours, **scale)
+    every = max(1, values.shape[0] // _MAP_CELLS)  # no panel has more pixels, and each cell costs time
+    shown = axes.imshow(
+        values[::every, ::every], origin="lower", extent=extent, cmap=colours, interpolation="nearest", **scale
+    )
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
     axes.figure.colorbar(shown, ax=axes, shrink=0.85)
 
@@ -124,17 +140,13 @@ def _local_mean(values: FloatArray) -> FloatArray:
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
-def _slopes(full: FullResult) -> Figure:
+def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     """Draw the measured slopes and the residuals of the fit."""
-    figure = Figure(figsize=(11, 9), layout="constrained")
-    axes = figure.subplots(2, 2)
+    figure, axes = sheet(11, 9, 2, 2)
     grid = full.grid
-    every = max(1, full.index.size // _SHOWN_PX**2)
-    x, y, gx, gy = full.field[:4, ::every]
-    for place, slope, name in ((axes[0, 0], gx, "dh/dx"), (axes[0, 1], gy, "dh/dy")):
-        points = place.scatter(x, y, c=1e3 * slope, s=1, cmap="RdBu_r", rasterized=True)
-        place.set(title=f"{name} measured (mrad)", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
-        figure.colorbar(points, ax=place, shrink=0.85)
+    for place, slope, name in ((axes[0, 0], seen.slope_x, "dh/dx"), (axes[0, 1], seen.slope_y, "dh/dy")):
+        milli = np.where(grid.count > 0, 1e3 * slope, np.nan)
+        show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, "RdBu_r", even=True)
     for place, slope, name in ((axes[1, 0], grid.slope_x, "dh/dx"), (axes[1, 1], grid.slope_y, "dh/dy")):
         left = np.where(grid.count > 0, 1e6 * slope, np.nan)
         show_map(place, f"{name} less the fit (urad)", grid.axis_mm, left, "RdBu_r", even=True)
@@ -149,8 +161,7 @@ def _modulation(
     swing = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
     swing[full.index] = full.swing_adu
     step = max(1, camera.height_px // _SHOWN_PX)
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = sheet(12, 5, 1, 2)
     extent = (-0.5, camera.width_px - 0.5, camera.height_px - 0.5, -0.5)
     picture = swing.reshape(camera.height_px, camera.width_px)[::step, ::step]
     figure.colorbar(left.imshow(picture, extent=extent), ax=left, shrink=0.85)
@@ -166,8 +177,7 @@ def _frames(measurement: Measurement) -> Figure:
     """Draw one tile per frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
     reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
-    figure = Figure(figsize=(9, 0.28 * len(names) + 1.2), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = sheet(9, 0.28 * len(names) + 1.2)
     colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
     axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
     for k in range(len(names)):
@@ -180,8 +190,7 @@ def _frames(measurement: Measurement) -> Figure:
 
 
 def _profile(profile: surface.RadialProfile) -> Figure:
-    figure = Figure(figsize=(7, 6), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, (upper, lower) = sheet(7, 6, 2, 1)
     upper.fill_between(profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring")
     upper.plot(profile.radius_mm, profile.mean_mm, label="measured, mean over azimuth")
     upper.plot(profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm")
@@ -195,8 +204,7 @@ def _profile(profile: surface.RadialProfile) -> Figure:
 
 
 def _convergence(full: FullResult) -> Figure:
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = sheet(6, 4)
     changes = full.fit.changes_mm
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
     axes.axhline(1e-6, linestyle="--", color="tab:red")
@@ -209,6 +217,8 @@ def result_recording(
     path: Path, application: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
     """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that fails."""
+    import rerun as rr
+
     recording = rr.RecordingStream(application)
     with scratch_folder(path.parent, ".recording-") as folder:
         try:
@@ -227,12 +237,16 @@ def result_recording(
 
 def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[Path]) -> None:
     """Log every picture below an entity, by file name."""
+    import rerun as rr
+
     for picture in pictures:
         recording.log(f"{entity}/{picture.stem}", rr.EncodedImage(path=picture), static=True)
 
 
 def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
     """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd). Raises OSError."""
+    import rerun as rr
+
     words = [f"verdict: {measurement.verdict} {measurement.reason}"]
     words += [f"{item['file']}: {item['reason']}" for item in measurement.flagged_files()]
     full = measurement.full

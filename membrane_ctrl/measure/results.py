@@ -233,7 +233,7 @@ def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(picture, format="png", dpi=dpi)
+    FigureCanvasAgg(figure).print_figure(picture, format="png", dpi=dpi, pil_kwargs={"compress_level": 3})
     write_bytes_atomic(path, picture.getvalue())
     return path
 

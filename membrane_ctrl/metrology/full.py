@@ -92,8 +92,10 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     x, y = tracer.position_mm(points)
     keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(axes[0].saturated | axes[1].saturated)
     keep &= swing > phase.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
-    rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)
-    return PixelPoints(index[keep], points.subset(keep), swing[keep], rest[keep], moved)
+    rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)[keep]
+    index, swing = index[keep], swing[keep]
+    del axes, x, y, in_bin, sensitivity  # the copies of the points follow, the most memory of a measurement
+    return PixelPoints(index, points.subset(keep), swing, rest, moved)
 
 
 def _rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:

@@ -9,7 +9,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.optics.compiled import kernel, step
@@ -61,6 +60,8 @@ def _cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray, Floa
 
 def _taylor(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
     """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the share of a cell."""
+    from scipy.interpolate import make_interp_spline  # loads for a third of a second; most screens have no map
+
     degree = min(_ORDER, nodes_mm.size) - 1
     spline = make_interp_spline(nodes_mm, values, k=degree)
     pitch = (nodes_mm[-1] - nodes_mm[0]) / (nodes_mm.size - 1)
