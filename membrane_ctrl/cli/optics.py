@@ -26,12 +26,15 @@ def measure(
     nominal_radius_mm: Annotated[
         float | None, typer.Option(min=1.0, help="Nominal radius of curvature, for the deviation of the power.")
     ] = None,
+    report: Annotated[bool, typer.Option("--report", help="Write report.html and report.pdf.")] = False,
     json: JsonOption = False,
 ) -> int:
     """Measure one capture set: height, Zernike coefficients, quality."""
-    from membrane_ctrl.measure.measure import measure_command
+    from membrane_ctrl.measure.measure import MeasureOptions, measure_command
 
-    return measure_command(capture_set, geometry, out, json, pictures, rerun, nominal_radius_mm)
+    return measure_command(
+        MeasureOptions(capture_set, geometry, out, json, pictures, rerun, nominal_radius_mm, report)
+    )
 
 
 def export_figure(

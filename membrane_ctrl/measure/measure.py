@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,30 +21,38 @@ from membrane_ctrl.model.arrays import FloatArray
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
 
 
-def measure_command(
-    folder: Path,
-    geometry: Path | None,
-    out: Path | None,
-    as_json: bool,
-    pictures: bool,
-    rerun: bool,
-    nominal_radius_mm: float | None = None,
-) -> int:
+@dataclass(frozen=True)
+class MeasureOptions:
+    """Options of the command."""
+
+    folder: Path
+    geometry: Path | None = None
+    out: Path | None = None
+    as_json: bool = False
+    pictures: bool = True
+    rerun: bool = False
+    nominal_radius_mm: float | None = None
+    report: bool = False
+
+
+def measure_command(options: MeasureOptions) -> int:
     """Measure one set, write the result and report it. Returns the exit code; raises InputError."""
+    folder, geometry = options.folder, options.geometry
     if folder.suffix == ".h5":
-        return facet_command(folder, as_json)
+        return facet_command(folder, options.as_json)
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: unknown key, ignored", file=sys.stderr)
-    target = out.resolve() if out else folder / "result"  # follow a link that the user names
+    target = options.out.resolve() if options.out else folder / "result"  # follow a link that the user names
     light, outline = _outline(measurement)
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry)
-    figure = figure_results.measured_figure(measurement, bars, nominal_radius_mm)
+    figure = figure_results.measured_figure(measurement, bars, options.nominal_radius_mm)
     block = figure_results.figure_table(measurement, figure, bars) if figure and bars else None
-    result, details = (
-        results.result_table(measurement, block),
-        results.details_table(measurement, profile, outline, bars),
+    result = results.result_table(measurement, block)
+    details = results.details_table(measurement, profile, outline, bars)
+    lines = _lines(measurement, profile, outline, bars) + (
+        [] if figure is None else figure_results.figure_lines(figure)
     )
     begin = time.perf_counter()
     with errors.writing(target):
@@ -51,20 +60,18 @@ def measure_command(
         if figure is not None:
             figure_results.write_figure_maps(target / "figure.npz", figure)
         drawn: list[Path] = []
-        if pictures:
+        if options.pictures or options.report:
             from membrane_ctrl.measure.pictures import draw_all
 
             drawn = draw_all(target, measurement, light, profile, outline, bars, figure)
-        if rerun:
+            if options.report:
+                figure_results.write_report(target, str(folder), lines, result, drawn)
+        if options.rerun:
             from membrane_ctrl.measure.pictures import log_measurement
 
             log_measurement(target / "measurement.rrd", measurement, drawn)
     print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
-    if as_json:
-        print(json.dumps(result))
-    else:
-        own = [] if figure is None else figure_results.figure_lines(figure)
-        print("\n".join(_lines(measurement, profile, outline, bars) + own))
+    print(json.dumps(result) if options.as_json else "\n".join(lines))
     return int(errors.Exit.REJECTED if measurement.verdict == "rejected" else errors.Exit.DONE)
 
 

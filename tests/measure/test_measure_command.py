@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tomllib
 from collections.abc import Callable
@@ -94,8 +95,9 @@ def test_a_fringes_set_leans_on_its_reference(made: Path, tmp_path: Path) -> Non
     assert deeper_um[3] == pytest.approx(282 * grown_mm, rel=0.05)
 
 
-def test_pictures_and_recording(made: Path, tmp_path: Path) -> None:
-    assert run(["measure", str(made / "0000"), "--out", str(tmp_path), "--rerun"]) == 0
+def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
+    options = ["--out", str(tmp_path), "--rerun", "--report", "--nominal-radius-mm", "3400"]
+    assert run(["measure", str(made / "0000"), *options]) == 0
     names = {path.stem for path in tmp_path.glob("*.png")}
     assert names == {
         "frames",
@@ -108,6 +110,22 @@ def test_pictures_and_recording(made: Path, tmp_path: Path) -> None:
         "uncertainty",
         "figure",
     }
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img ") == page.count("src='data:image/png;base64,") == len(names)
+    assert not re.search("https?:|<script|<link", page)
+    figure = json.loads((tmp_path / "result.json").read_text())["figure"]
+    depth = 3400 - np.sqrt(3400**2 - 475**2)
+    told = figure["numbers"]["power_um"]["value"]
+    assert told == pytest.approx(1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6)
+    assert f"<td>power_um<td>{told:.6g}<td>" in page
+    assert figure["not_given"] == {}
+    document = (tmp_path / "report.pdf").read_bytes()
+    assert document.startswith(b"%PDF-")
+    assert document.count(b"/Type /Page ") >= 1 + len(names) / 2
+    maps = np.load(tmp_path / "figure.npz")
+    assert np.nanmax(maps["deviation_um"]) - np.nanmin(maps["deviation_um"]) == pytest.approx(
+        figure["numbers"]["irregularity_pv_um"]["value"]
+    )
     assert (tmp_path / "measurement.rrd").stat().st_size > 10_000
     details = json.loads((tmp_path / "details.json").read_text())
     assert details["hencky_sag_mm"] == pytest.approx(37.1, abs=0.05)
