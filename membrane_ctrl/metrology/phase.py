@@ -88,31 +88,110 @@ def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[In
 
     Parameters
     ----------
-    gray : (4, ...) array
-        Intensities of the bits, most significant first.
+    gray : (n, ...) array
+        Intensities of the bits, most significant first; the last is for half a period.
     white, black : (...) array
         Highest and lowest level at each pixel; the threshold is their mean, pixel by pixel.
 
     Returns
     -------
     k1, k2 : (...) int arrays
-        floor(s / T) from bits 1-3 and floor((V2 + 1) / 2) from all four, V2 = floor(2 s / T).
+        floor(s / T) from all bits but the last, and floor((V2 + 1) / 2) from all, V2 = floor(2 s / T).
     """
     threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
     return code_orders(np.asarray(gray, float) > threshold)
 
 
 def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
-    """The same from the bits (4, ...)."""
+    """The same from bits (n, ...) of any number, the last of them for half a period."""
     binary = np.bitwise_xor.accumulate(bits.astype(np.int64), axis=0)  # each bit is the xor of all above it
-    k1 = 4 * binary[0] + 2 * binary[1] + binary[2]
-    return k1, (2 * k1 + binary[3] + 1) // 2
+    half_periods = np.tensordot(1 << np.arange(len(binary))[::-1], binary, axes=1)
+    return half_periods // 2, (half_periods + 1) // 2
 
 
 def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
     """The paper's eq. 2: phase counted from the low edge's -pi."""
     order = np.where(wrapped_rad <= -math.pi / 2, k2, np.where(wrapped_rad >= math.pi / 2, k2 - 1, k1))
     return wrapped_rad + 2 * math.pi * order
+
+
+# Frames of other benches (docs/library.md): fringes of several periods, and fringes of both axes in one frame.
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places on the screen from phases of several periods."""
+
+    place_mm: FloatArray  # (...): NaN where the phases contradict each other, or fit two places alike
+    misfit: FloatArray  # (...): chi-square of the phases there, a number near F - 1 if `sigma_rad` is right
+
+
+def places_mm(
+    wrapped_rad: FloatArray,
+    periods_mm: Sequence[float] | FloatArray,
+    range_mm: tuple[float, float],
+    sigma_rad: float = 0.1,
+) -> Places:
+    """Places that explain wrapped phases of any two or more periods, which need not be multiples of each other.
+
+    Every order of the shortest period within the range is tried; the others choose. The place is then the least
+    squares of all. It is NaN unless its chi-square is believable (below F - 1 + 25) and 25 better than that of every
+    place more than half a shortest period away: five sigma.
+
+    Parameters
+    ----------
+    wrapped_rad : (F, ...) array
+        Phases, zero (or any multiple of 2 pi) at place 0, growing with the place; any branch.
+    periods_mm : (F,) array
+        In any order.
+    range_mm : (float, float)
+        Where on the screen to look.
+    sigma_rad : float
+        1 sigma of a phase, noise and the display's harmonics together.
+
+    Raises ValueError for fewer than two periods, periods that do not match the phases, or an empty range.
+    """
+    periods = np.asarray(periods_mm, float)
+    low, high = range_mm
+    if periods.shape != (len(wrapped_rad),) or periods.size < 2 or not (periods > 0).all() or not high > low:
+        raise ValueError(f"{len(wrapped_rad)} phases need as many periods, at least two, all above zero, and a range")
+    turns = np.asarray(wrapped_rad, float) / (2 * math.pi)
+    fine, pitch = int(np.argmin(periods)), float(periods.min())
+    first = np.mod(turns[fine] - low / pitch, 1.0) * pitch + low
+    rates = (1 / periods).reshape(-1, *[1] * first.ndim)
+    best, second = np.full((2, *first.shape), np.inf)
+    place = np.full(first.shape, np.nan)
+    for order in range(math.ceil((high - low) / pitch)):
+        tried = first + order * pitch
+        left = turns - tried * rates
+        left -= np.rint(left)
+        tried = tried + np.sum(left * rates, axis=0) / np.sum(rates**2)
+        left = turns - tried * rates
+        left -= np.rint(left)
+        cost = np.where((tried >= low) & (tried <= high), np.sum(left**2, axis=0), np.inf)
+        second = np.minimum(second, np.maximum(cost, best))
+        place = np.where(cost < best, tried, place)
+        best = np.minimum(cost, best)
+    scale = (2 * math.pi / sigma_rad) ** 2
+    sure = (scale * best < periods.size - 1 + _FIVE_SIGMA) & (scale * (second - best) > _FIVE_SIGMA)
+    return Places(np.where(sure, place, np.nan), scale * best)
+
+
+_FIVE_SIGMA = 25.0
+
+
+def crossed_phasors(frames: ArrayLike, shifts_x_rad: ArrayLike, shifts_y_rad: ArrayLike) -> ComplexArray:
+    """Phasors (2, ...) of the x and of the y fringes in frames (N, ...) that show both.
+
+    I = A + B_x cos(phi_x + d_x) + B_y cos(phi_y + d_y), least squares. Raises ValueError if the N pairs of steps do
+    not separate the two (fewer than five, or steps that go together).
+    """
+    stack, x, y = (np.asarray(a, float) for a in (frames, shifts_x_rad, shifts_y_rad))
+    design = np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=1)
+    if len(design) < 5 or np.linalg.cond(design) > 100:
+        raise ValueError(f"{len(design)} pairs of phase steps do not determine the phases of crossed fringes")
+    _, *parts = np.tensordot(np.linalg.pinv(design), stack, axes=1)
+    return np.stack([parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]])
 
 
 def centre_phase_rad(pattern: PatternConfig) -> float:
