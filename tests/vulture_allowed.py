@@ -20,3 +20,4 @@ _.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_
 _.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregularity_rms_um  # numbers of a figure,
 _.pvr_um, _.rotational_pv_um, _.asymmetry_rms_um, _.slope_rms_urad  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
+_.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
