@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -81,3 +82,22 @@ def test_tcp_clients_of_every_kind(host_board: dict[str, str]) -> None:
         assert client.recv(64) == b""
     for client in clients:
         client.close()
+
+
+@pytest.mark.real_time
+@pytest.mark.skipif(shutil.which("mbpoll") is None, reason="no mbpoll: `make board` installs it")
+@pytest.mark.parametrize("line", ["rtu", "tcp"])
+def test_a_client_that_is_not_ours_reads_and_stops(host_board: dict[str, str], line: str) -> None:
+    """mbpoll, over libmodbus."""
+    mode = ["-m", "rtu", "-b", "115200", "-P", "none"] if line == "rtu" else ["-m", "tcp", "-p", host_board["tcp"]]
+    target = host_board["rtu"] if line == "rtu" else "127.0.0.1"
+    base = ["mbpoll", *mode, "-a", "1", "-0", "-o", "5"]
+
+    def polled(address: int, *written: str) -> str:
+        words = [*base, "-r", str(address), "-t", "4:hex", "-1", target, *written]
+        return subprocess.run(words, check=True, capture_output=True, text=True).stdout
+
+    assert "0x4D42" in polled(0)
+    assert "0x0000" in polled(37)
+    assert "Written 1 references" in polled(72, "0x0001")
+    assert "0x0004" in polled(37)

@@ -68,6 +68,30 @@ def test_the_pump_is_off_in_the_first_millisecond_after_the_period(
     assert sensors(virtual_board)["latched_faults"] == _MAP.fault_mask("watchdog")
 
 
+def test_the_period_counts_from_the_write_not_from_the_tick_before_it(virtual_board: VirtualBoard) -> None:
+    run_pump(virtual_board, 0.05)
+    virtual_board.pass_us(400)
+    virtual_board.hear(rtu_frame(1, command(2)))
+    virtual_board.pass_us(100)  # heard here, halfway between two ticks
+    virtual_board.pass_us(1750)  # executed here, 250 us after a tick
+    virtual_board.chip.virtual_skip(100)  # the next tick is late
+    virtual_board.pass_us(750)
+    virtual_board.pass_us(49_000)
+    assert virtual_board.outputs == (25_000, 12_500), "49.85 ms after the write"
+    virtual_board.pass_us(_TICK_US)
+    assert virtual_board.outputs == (0, 12_500)
+
+
+def test_clearing_another_fault_does_not_feed(virtual_board: VirtualBoard) -> None:
+    run_pump(virtual_board, 0.05)
+    virtual_board.pass_us(20_000)
+    virtual_board.ask(write("stop", {"stop": 1}))
+    virtual_board.pass_us(10_000)
+    virtual_board.ask(write("reset", {"clear_faults": 0xFFFF, "clear_key": _KEY}))
+    virtual_board.pass_us(20_000)
+    assert sensors(virtual_board)["latched_faults"] == _MAP.fault_mask("watchdog")
+
+
 def test_a_watchdog_trip_does_not_expire(virtual_board: VirtualBoard) -> None:
     """A counter of microseconds wraps after 71 minutes."""
     run_pump(virtual_board)
