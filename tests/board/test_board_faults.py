@@ -140,6 +140,14 @@ def test_a_stopped_processor_is_reset(virtual_board: VirtualBoard) -> None:
     assert (virtual_board.outputs, virtual_board.resets) == ((0, 0), 1)
 
 
+def test_a_clock_that_stands_still_resets_the_board(virtual_board: VirtualBoard) -> None:
+    run_pump(virtual_board, 10.0)
+    virtual_board.chip.board_tick()  # an interrupt, and no microsecond has passed
+    assert virtual_board.outputs == (0, 0)
+    virtual_board.pass_us(_TICK_US)
+    assert virtual_board.resets == 1
+
+
 def test_every_damaged_bit_of_what_the_board_decides_by_resets_it_in_a_millisecond(
     virtual_board: VirtualBoard,
 ) -> None:
@@ -179,7 +187,8 @@ def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(vi
 
 @pytest.mark.parametrize("damage", ["absent", "blank", "flipped", "short", "baud", "divisor"])
 def test_a_board_without_valid_settings_has_no_values_and_no_pump(virtual_board: VirtualBoard, damage: str) -> None:
-    good = record({**SETTINGS, "unit_id": 9})
+    records = (record({**SETTINGS, "unit_id": 9, "silence_us": 2000 + tried}) for tried in range(5000))
+    good = next(found for found in records if found[-1] == 0)  # the byte that a short one lacks is 0 in memory
     bad = {
         "absent": b"", "blank": b"\xff" * len(good), "short": good[:-1],
         "flipped": good[:30] + bytes([good[30] ^ 1]) + good[31:],
@@ -252,6 +261,10 @@ def test_a_frame_is_one_only_between_silences(virtual_board: VirtualBoard) -> No
     virtual_board.hear(ask[:4])
     virtual_board.chip.virtual_hear_damage()
     assert virtual_board.ask_frame(ask[4:]) == b""
+    query = rtu_frame(1, bytes.fromhex("08000012fe"))
+    virtual_board.hear(query[:5])
+    virtual_board.chip.virtual_hear_damage()  # instead of 0xfe, which is -2 as the layer's error is
+    assert virtual_board.ask_frame(query[6:]) == b""
     assert virtual_board.ask_frame(bytes(300) + ask) == b""
     assert virtual_board.ask_frame(ask[:3]) == b""
     assert virtual_board.ask_frame(ask) == answer
