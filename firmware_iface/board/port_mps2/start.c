@@ -40,12 +40,10 @@ static void prepare(void)
 {
     const uint32_t *from = data_stored;
     /* the linker's symbols bound one object each */
-    // cppcheck-suppress comparePointers
     for (uint32_t *to = data_start; to < data_end; to++) {
         *to = *from;
         from++;
     }
-    // cppcheck-suppress comparePointers
     for (uint32_t *to = bss_start; to < bss_end; to++) {
         *to = 0u;
     }

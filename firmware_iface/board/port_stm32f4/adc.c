@@ -46,7 +46,7 @@ void adc_start(void)
     ADC_SMPR1 = 0x00000007u;       /* channel 10: 480 clocks */
     ADC_SMPR2 = 0x0700703Fu;       /* 0, 1, 4, 8 */
     ADC_SQR1 = (CHANNELS - 1u) << 20;
-    ADC_SQR3 = 0u | (1u << 5) | (4u << 10) | (8u << 15) | (10u << 20);
+    ADC_SQR3 = (1u << 5) | (4u << 10) | (8u << 15) | (10u << 20); /* 0 first */
     ADC_CR2 = 0x00000303u;         /* on, continuous, DMA again and again */
     ADC_CR2 |= 0x40000000u;        /* start */
     started_us = hal_micros();
