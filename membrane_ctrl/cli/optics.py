@@ -24,7 +24,7 @@ def measure(
     pictures: Annotated[bool, typer.Option(help="Draw pictures next to the result.")] = True,
     rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")] = False,
     nominal_radius_mm: Annotated[
-        float | None, typer.Option(min=1.0, help="Nominal radius of curvature, for the deviation of the power.")
+        float | None, typer.Option(help="Nominal radius of curvature, for the deviation of the power.")
     ] = None,
     report: Annotated[bool, typer.Option("--report", help="Write report.html and report.pdf.")] = False,
     json: JsonOption = False,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.measure.results import read_arrays
+from membrane_ctrl.metrology.figure import LEAST_CELLS
 from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
@@ -105,7 +106,7 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
     if not np.isfinite(steps).all() or steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.max():
         raise errors.InputError(f"{where}: x_mm and y_mm must rise in even steps of one size")
     measured = np.isfinite(height)
-    if np.count_nonzero(measured) < 2 * zernike.FRINGE_TERMS:
+    if np.count_nonzero(measured) < LEAST_CELLS:
         raise errors.InputError(f"{where}: has {np.count_nonzero(measured)} measured cells, too few for a figure")
     if not np.nanmax(np.abs(np.where(measured, height, 0))) <= _HEIGHT_MAX_MM or np.isinf(height).any():
         raise errors.InputError(f"{where}: h_mm has heights beyond {_HEIGHT_MAX_MM:g} mm")

@@ -15,6 +15,7 @@ import numpy as np
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
 from membrane_ctrl.metrology.figure import (
+    LEAST_CELLS,
     Figure,
     FigureBars,
     FigureOf,
@@ -24,6 +25,7 @@ from membrane_ctrl.metrology.figure import (
     power_spectrum,
 )
 from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
 from membrane_ctrl.model.terminal import plain
 
@@ -55,12 +57,20 @@ class MeasuredFigure:
 def measured_figure(
     measurement: Measurement, bars: ErrorBars | None, nominal_radius_mm: float | None = None
 ) -> MeasuredFigure | None:
-    """Evaluate the figure of a measurement; None if it has no usable one."""
+    """Evaluate the figure of a measurement; None if it has no usable one, or hardly a cell.
+
+    Raises InputError for a nominal radius that no sphere over the aperture has; negative ones are convex.
+    """
     full, mirror = measurement.full, measurement.head.optics.mirror
+    if nominal_radius_mm is not None and not abs(nominal_radius_mm) > mirror.analysis_radius_mm:
+        least = f"larger than the aperture's radius, {mirror.analysis_radius_mm:g} mm"
+        raise InputError(f"--nominal-radius-mm {nominal_radius_mm:g}: must be {least}")
     if full is None or bars is None or measurement.verdict == "rejected":
         return None
     aperture = mirror.analysis_radius_mm
     seen = full.map()
+    if np.count_nonzero(np.isfinite(seen.height_mm)) < LEAST_CELLS:
+        return None
     found = FigureOf(seen, aperture)(seen)
     of_noise = figure_bars(seen, aperture, mirror.radius_mm, bars.noise, bars.cell_slope)
     of_geometry = figure_bars(seen, aperture, mirror.radius_mm, bars.geometry)

@@ -16,6 +16,7 @@ from membrane_ctrl.model.arrays import FloatArray
 
 _FRINGE = [zernike.fringe(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
 _PVR_TERMS = 36
+LEAST_CELLS = 4 * zernike.FRINGE_TERMS  # fewer give no figure
 _RINGS = 96  # knots of the rotationally invariant part: 5 mm on a 1 m mirror
 _SHARES = (0.5, 0.8, 0.95)  # of the encircled energy
 
@@ -82,7 +83,7 @@ class FigureOf:
     Parameters
     ----------
     seen : SurfaceMap
-        A surface; any other has the same grid and the same measured cells.
+        A surface with at least `LEAST_CELLS`; any other has the same grid and the same measured cells.
     aperture_mm : float
         Radius of the aperture, by which the Fringe terms are counted.
     """
@@ -95,7 +96,7 @@ class FigureOf:
         self._pvr = zernike.GridFit(axis, self._mask, _FRINGE[:_PVR_TERMS])
         rows, columns = np.nonzero(self._mask)
         r = np.hypot(seen.axis_mm[rows], seen.axis_mm[columns])
-        self._rings = _Rings(r, min(_RINGS, len(axis) // 4))
+        self._rings = _Rings(r, max(2, min(_RINGS, len(axis) // 4)))
 
     def __call__(self, seen: SurfaceMap) -> Figure:
         """The figure of a surface."""
@@ -216,6 +217,8 @@ def figure_bars(
         1 sigma of the mean slope of a cell by white noise.
     """
     thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
+    if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:  # a map with few cells, here and there
+        thin = seen
     if not np.isfinite(covariance_mm2).all():
         nothing = Quantities(*[np.nan] * len(fields(Quantities)))
         return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))

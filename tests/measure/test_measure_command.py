@@ -133,6 +133,14 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     assert details["rim"]["offset_mm"] < 3
 
 
+def test_a_nominal_radius_below_the_apertures_is_refused(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["measure", str(made / "0000"), "--out", str(tmp_path), "--nominal-radius-mm", "-400"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "membrane-ctrl: --nominal-radius-mm -400: must be larger than the aperture's radius, 475 mm"
+
+
 @pytest.mark.parametrize("frame", ["x_sin_2.png", "y_gray_3.png", "white.png", "black.png"])
 def test_a_missing_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path: Path, frame: str) -> None:
     (capture_set / frame).unlink()

@@ -196,3 +196,16 @@ def test_a_covariance_that_is_unknown_gives_no_error_bar() -> None:
     bars = figure.figure_bars(seen(ball(3400.0)), APERTURE, 500.0, np.full((36, 36), np.nan))
     assert np.isnan(astuple(bars.numbers)).all()
     assert np.isnan(bars.fringe_um).all()
+
+
+@pytest.mark.parametrize(
+    "part",
+    [X > 0, R > 400, (R > 50) & (np.abs(X) > 30), np.random.default_rng(1).random(X.shape) < 0.03],
+    ids=["half", "ring", "spider", "scattered"],
+)
+def test_a_figure_of_any_part_of_a_mirror(part: np.ndarray) -> None:
+    height = np.where(part & INSIDE, ball(3400.0), np.nan)
+    some = figure.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
+    assert of(some).numbers.radius_of_curvature_mm == pytest.approx(3400, rel=1e-6)
+    bars = figure.figure_bars(some, APERTURE, 500.0, 1e-12 * np.eye(36), 1e-6)
+    assert np.isfinite(astuple(bars.numbers)).all()

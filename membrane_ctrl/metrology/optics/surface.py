@@ -218,4 +218,4 @@ def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> 
     square = np.einsum("in,in->n", q, q)
     rows = np.stack([-normals[2], turn_x @ q / s, turn_y @ q / s, (deviation**2 - square) / (2 * s)])
     rows *= columns[:, None]
-    return np.asarray(columns * np.linalg.solve(rows @ rows.T, -rows @ deviation))
+    return np.asarray(columns * np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0])

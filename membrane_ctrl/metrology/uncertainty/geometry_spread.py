@@ -6,8 +6,8 @@ shifted (mm, in world) and turned (rad, a rotation vector in world, about the pi
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, Vector3
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
@@ -108,7 +108,7 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
 
 def _turn(amounts: dict[str, float], thing: str) -> FloatArray:
     vector = [amounts.get(f"{thing}_turn_{axis}_rad", 0.0) for axis in "xyz"]
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+    return np.asarray(cv2.Rodrigues(np.array(vector))[0])
 
 
 def _shifted(place_mm: Vector3, amounts: dict[str, float], thing: str) -> Vector3:
