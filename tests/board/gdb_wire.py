@@ -37,6 +37,12 @@ class StoppedBoard:
         assert not answer.startswith("E"), f"{packet}: {answer}"
         return answer
 
+    async def step(self) -> None:
+        """Execute one instruction, without interrupts."""
+        self._say("s")
+        while not (await self._packet()).startswith("T05"):
+            continue
+
     async def run_to(self, address: int) -> None:
         """Let it run until it comes to an address."""
         await self.ask(f"Z0,{address:x},2")
