@@ -194,7 +194,16 @@ def laser_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """laser.c for this machine."""
     folder = tmp_path_factory.mktemp("laser")
     (folder / "host.c").write_text(HOST)
-    words = ["cc", "-shared", "-fPIC", "-O1", f"-I{PORT.parent / 'core'}", f"-I{PORT}", "-Wno-int-to-pointer-cast"]
+    words = [
+        "cc",
+        "-shared",
+        "-fPIC",
+        "-O1",
+        f"-I{PORT.parent / 'core'}",
+        f"-I{PORT}",
+        f"-I{PORT.parent / 'port_cortex_m'}",
+        "-Wno-int-to-pointer-cast",
+    ]
     subprocess.run(
         [*words, "-o", str(folder / "laser.so"), str(PORT / "laser.c"), str(folder / "host.c")], check=True
     )

@@ -4,10 +4,10 @@
 
 #include "bench_line.h"
 #include "board.h"
+#include "cortex_m.h"
 #include "hal.h"
 #include "mps2.h"
 
-#define WORD(address) (*(volatile uint32_t *)(address))
 #define CLOCK_HZ 25000000u
 
 #define TIMER0_CTRL WORD(0x40000000u)
@@ -32,8 +32,6 @@
 #define UARTS_BELOW_TIMER 0x40404040u /* interrupts 0..3; the timer's, 8, keeps priority 0 */
 #define INTERRUPTS_USED 0x10Fu
 
-#define AIRCR WORD(0xE000ED0Cu)
-#define AIRCR_RESET 0x05FA0004u
 
 #define UART_TX_FULL 1u
 #define UART_RX_FULL 2u
@@ -109,7 +107,7 @@ void hal_init(void)
     FPGAIO_PRESCALE = (CLOCK_HZ / 1000000u) - 1u;
     UART1->divider = CLOCK_HZ / FILM_BAUD;
     UART1->ctrl = UART_ALL_ON;
-    mps2_outputs_safe();
+    port_outputs_safe();
 }
 
 const uint8_t *hal_settings(size_t *length)
@@ -162,7 +160,7 @@ void hal_watchdog_feed(void)
 
 void hal_reset(void)
 {
-    mps2_outputs_safe();
+    port_outputs_safe();
     AIRCR = AIRCR_RESET;
     for (;;) {
     }
@@ -250,7 +248,7 @@ void mps2_timer0(void)
     board_tick();
 }
 
-void mps2_outputs_safe(void)
+void port_outputs_safe(void)
 {
     static const uint8_t SAFE[] = "\nO 0 0\n";
     for (uint32_t i = 0u; i < (sizeof(SAFE) - 1u); i++) {

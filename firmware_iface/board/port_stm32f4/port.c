@@ -165,7 +165,7 @@ void hal_watchdog_feed(void)
     IWDG_KR = IWDG_FEED;
 }
 
-void stm32_outputs_safe(void)
+void port_outputs_safe(void)
 {
     TIM3->ccr1 = 0u;
     TIM3->ccr2 = 0u;
@@ -174,7 +174,7 @@ void stm32_outputs_safe(void)
 
 void hal_reset(void)
 {
-    stm32_outputs_safe();
+    port_outputs_safe();
     AIRCR = AIRCR_RESET;
     for (;;) {
     }

@@ -3,9 +3,8 @@
 #define MEMBRANE_STM32F4_H
 
 #include <stdbool.h>
-#include <stdint.h>
 
-#define WORD(address) (*(volatile uint32_t *)(address))
+#include "cortex_m.h"
 
 /* Clocks. QEMU has no clock tree: its processor runs at 168 MHz, its timers at 1 GHz, whatever is written. */
 #ifdef QEMU_CLOCKS
@@ -81,11 +80,8 @@ struct usart {
 #define NVIC_ISER0 WORD(0xE000E100u)
 #define NVIC_ISER1 WORD(0xE000E104u)
 #define SHPR3 WORD(0xE000ED20u)
-#define AIRCR WORD(0xE000ED0Cu)
-#define AIRCR_RESET 0x05FA0004u
 
 /* What the files of this port need of each other. */
-void stm32_outputs_safe(void);
 void stm32_usart1(void);
 void stm32_usart2(void);
 void stm32_tick(void);

@@ -1,28 +1,21 @@
-/* Reset, vectors and faults of the Cortex-M3 (ARMv7-M architecture reference manual, DDI 0403). */
-#include <stdint.h>
+/* Reset and faults of a Cortex-M3 or M4 (ARMv7-M architecture reference manual, DDI 0403). */
+#include "cortex_m.h"
 
-#include "mps2.h"
-
-#define WORD(address) (*(volatile uint32_t *)(address))
-#define AIRCR WORD(0xE000ED0Cu)      /* application interrupt and reset control, B3.2.6 */
-#define AIRCR_RESET 0x05FA0004u      /* key, SYSRESETREQ */
 #define MPU_CTRL WORD(0xE000ED94u)   /* B3.5.5 */
 #define MPU_RBAR WORD(0xE000ED9Cu)
 #define MPU_RASR WORD(0xE000EDA0u)
 #define MPU_ON_BESIDE_DEFAULT 5u     /* PRIVDEFENA, ENABLE: what no region covers is as without an MPU */
 #define MPU_NO_ACCESS_32_BYTES 0x10000009u /* XN, AP 000, size 2^(4+1), on */
 
-extern uint32_t data_start[], data_end[], bss_start[], bss_end[], interrupt_stack_top[], main_stack_top[];
+extern uint32_t data_start[], data_end[], bss_start[], bss_end[], main_stack_top[];
 extern const uint32_t data_stored[];
 extern uint32_t main_stack_guard[];
 
 int main(void);
-void start(void);
 
-/* Any fault, any interrupt that nobody expects, the watchdog's first warning: safe, then a reset. */
-static void fault(void)
+void fault(void)
 {
-    mps2_outputs_safe();
+    port_outputs_safe();
     AIRCR = AIRCR_RESET;
     for (;;) {
     }
@@ -39,7 +32,6 @@ static void fault_guard(void)
 static void prepare(void)
 {
     const uint32_t *from = data_stored;
-    /* the linker's symbols bound one object each */
     for (uint32_t *to = data_start; to < data_end; to++) {
         *to = *from;
         from++;
@@ -62,20 +54,3 @@ __attribute__((naked)) void start(void)
                    "isb\n"
                    "bl %0\n" ::"i"(prepare));
 }
-
-union vector {
-    uint32_t *stack;
-    void (*handler)(void);
-};
-
-#define F {.handler = fault}
-#define H(name) {.handler = name}
-
-__attribute__((section(".vectors"), used)) static const union vector VECTORS[16 + 32] = {
-    {.stack = interrupt_stack_top}, H(start), F, F, F, F, F, F,
-    F, F, F, F, F, F, F, F,
-    H(mps2_uart0), H(mps2_uart0), H(mps2_uart1), H(mps2_uart1), F, F, F, F,
-    H(mps2_timer0), F, F, F, F, F, F, F,
-    F, F, F, F, F, F, F, F,
-    F, F, F, F, F, F, F, F,
-};
