@@ -11,11 +11,12 @@ import contextlib
 import ctypes
 import itertools
 import math
+import os
 import random
 import shutil
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,8 @@ import pytest
 from firmware_iface import conformance, roles
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.optoncdt1420 import three_bytes
+from tests.board.gdb_wire import StoppedBoard, stopped
+from tests.board.qemu_board import addresses
 
 PORT = Path(__file__).parents[2] / "firmware_iface" / "board" / "port_stm32f4"
 NO_VALUE = -(2**31)
@@ -80,6 +83,7 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
         "qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-kernel", image,
         "-device", f"loader,file={settings},addr=0x0800C000,force-raw=on",
         "-serial", f"tcp:127.0.0.1:{port}", "-serial", "pty",
+        "-gdb", f"unix:{folder}/gdb,server=on,wait=off",
         "-d", "unimp,guest_errors", "-D", folder / "log", "-monitor", f"unix:{folder}/monitor,server=on,wait=off",
     ]  # fmt: skip
     process = await asyncio.create_subprocess_exec(
@@ -89,11 +93,13 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
         assert process.stdout is not None
         said = (await asyncio.wait_for(process.stdout.readline(), START_S)).decode()
         line = next(word for word in said.split() if word.startswith("/dev/"))
+        kept = os.open(line, os.O_RDWR | os.O_NOCTTY)  # QEMU takes a second to notice a new client, and loses answers
         laser = await asyncio.wait_for(lasers.get(), START_S)
         monitor = await asyncio.open_unix_connection(folder / "monitor")
         yield Stm32(f"rtu://{line}?baud=115200&parity=N", folder / "log", laser, *monitor)
         monitor[1].close()
         laser.close()
+        os.close(kept)
     finally:
         process.terminate()
         await asyncio.wait_for(process.communicate(), START_S)
@@ -180,6 +186,58 @@ async def test_the_image_conforms(tmp_path: Path) -> None:
         findings = await conformance.examine(board.url, 1, 4.0)
         assert [each for each in findings if each.problem] == []
         assert len(findings) > 15
+
+
+async def _damage_memory(board: StoppedBoard, at: dict[str, int]) -> None:
+    (byte,) = await board.read(at["now"] + 200, 1)
+    await board.write(at["now"] + 200, bytes([byte ^ 0x10]))
+
+
+async def _overflow_the_stack(board: StoppedBoard, at: dict[str, int]) -> None:
+    assert await board.register(13) > at["main_stack_guard"], "stopped within an interrupt"
+    await board.set_register(13, at["main_stack_guard"] + 16)
+
+
+async def _run_wild(board: StoppedBoard, at: dict[str, int]) -> None:
+    await board.write(at["rtu_poll"], bytes.fromhex("ffff"))  # not an instruction
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("damage", [_damage_memory, _overflow_the_stack, _run_wild])
+async def test_a_damaged_board_drives_its_outputs_low_and_starts_anew(
+    tmp_path: Path, damage: Callable[[StoppedBoard, dict[str, int]], Awaitable[None]]
+) -> None:
+    """As far as QEMU goes: what only the hardware watchdog ends, such as a stuck tick, is not here."""
+    async with stm32(tmp_path) as board:
+        driver = PumpBoard(board.url, timeout_s=4.0, watchdog_s=10.0)
+        await driver.open()
+        await driver.write(roles.BenchCommand(0.25, 1.0))
+        await board.drives(PWM_STEPS // 4, PWM_STEPS)
+        async with stopped(tmp_path / "gdb") as processor:
+            await damage(processor, addresses(tmp_path / "stm32f4-qemu.elf"))
+        await board.drives(0, 0)
+        async with asyncio.timeout(START_S):
+            while [each[:2] for each in written(board.log)].count(("RCC", 0x30)) < 2:  # noqa: ASYNC110
+                await asyncio.sleep(0.05)
+        await driver.close()
+    wrote = written(board.log)
+    start = [each[:2] for each in wrote].index(("RCC", 0x30), 1)
+    assert ("GPIOB", 0x18, 0x20_0000) in wrote[start - 4 : start]  # low before the reset, not only by it
+    assert ("GPIOA", 0x18, 0x01C0_0000) in wrote[start - 4 : start]
+
+
+@pytest.mark.campaign
+async def test_a_main_loop_that_hangs_stops_the_pump(tmp_path: Path) -> None:
+    """The vent stays as it was; on silicon the watchdog, no longer fed, then resets the board."""
+    async with stm32(tmp_path) as board:
+        driver = PumpBoard(board.url, timeout_s=4.0, watchdog_s=10.0)
+        await driver.open()
+        await driver.write(roles.BenchCommand(0.25, 1.0))
+        await board.drives(PWM_STEPS // 4, PWM_STEPS)
+        async with stopped(tmp_path / "gdb") as processor:
+            await processor.write(addresses(tmp_path / "stm32f4-qemu.elf")["rtu_poll"], bytes.fromhex("fee7"))  # b .
+        await board.drives(0, PWM_STEPS)
+        await driver.close()
 
 
 HOST = """
