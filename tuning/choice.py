@@ -80,7 +80,8 @@ GAIN_KEYS = (
     "barometer_gain_um_per_pa",
     "temperature_gain_um_per_k",
 )
-_ANY = ("setpoint_um", "bleed_fraction")  # settings of a loop on which its gains do not depend
+# settings on which gains do not depend
+_ANY = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> int:
@@ -135,7 +136,7 @@ def _require_same_bench(path: Path | str, config: schema.Config, folder: Session
         here, there = getattr(config, section), getattr(tuned, section)
         for key in type(here).model_fields:
             now, then = getattr(here, key), getattr(there, key)
-            if now != then and not (section == "loop" and key in (*GAIN_KEYS, *_ANY)):
+            if now != then and key not in (*GAIN_KEYS, *_ANY):
                 raise InputError(
                     f"{path}: {section}.{key} = {now}, the session had {then}: its gains do not fit; tune with this "
                     "configuration"

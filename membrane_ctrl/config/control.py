@@ -72,6 +72,11 @@ class PumpConfig(Section):
     """Flow of a running pump at each of these commands. Set it with `tune pump`."""
     curve_falling_um_per_s: tuple[Annotated[float, Field(ge=0, le=100)], ...] = ()
     """Flow when a command is reached from a larger one. Set it with `tune pump` for a pump with hysteresis."""
+    probe_um: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Amplitude of a sine of 5 s by which a hold moves the centre to learn the pump's drift from its curve; 0: none.
+    Set it to half the centre's standard deviation: 0.1 gives 5 % after three hours at 1 um of laser noise."""
+    change_max: Annotated[float, Field(gt=0, le=1)] = 0.12
+    """Drift of the pump from its curve that causes the notice `pump_drift`. Raise it for a pump that varies."""
 
     @model_validator(mode="before")
     @classmethod

@@ -10,6 +10,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
+from membrane_ctrl.control.pump_drift import PumpScale
+
 # The mirror's loss of gas, from the pump's flow and the motion of the centre.
 #
 # Balance of gas, as speed of the centre:  dy/dt = v - leak + w,  and the feed-forward is -w as far as it is known, so
@@ -170,3 +172,27 @@ class FilmHealth:
             return 0.0
         first, last = self._hours[0].pressure_pa, self._hours[-1].pressure_pa
         return (first - last) / first * DAY_HOURS / hours
+
+
+_PUMP_EVERY = 10  # segments of a minute between reports
+_PUMP_SIGMAS = 3.0
+
+
+class PumpHealth:
+    """Reports what a hold has learned of its pump, and warns once of a drift beyond `change_max`."""
+
+    def __init__(self, change_max: float) -> None:
+        self._change_max = change_max
+        self._count = 0
+        self._warned = False
+
+    def step(self, known: PumpScale) -> tuple[bool, tuple[FilmWarning, ...]]:
+        """Take a segment's estimate; returns whether to report it, and a new or withdrawn warning."""
+        self._count += 1
+        change = known.scale - 1.0
+        bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (BETTER if self._warned else 1.0)
+        says = f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than its curve"
+        says += f" (+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
+        news = (FilmWarning("pump_drift", says if bad else "no longer so", bad),) if bad != self._warned else ()
+        self._warned = bad
+        return bool(news) or self._count % _PUMP_EVERY == 0, news

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control import film_health, filters, gas, pid
+from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
@@ -44,6 +44,7 @@ class LoopOutput:
     too_tight: bool = False  # the mirror loses too little gas to be held within the band
 
 
+_AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
 NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
 
 
@@ -66,6 +67,9 @@ class InnerLoop:
         self._feedforward = gas.FeedForward(loop)
         self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
         self._curve = gas.PumpCurve(pump)
+        self._probe_um = pump.probe_um
+        self._drift = pump_drift.PumpDrift(DEAD_S, PUMP_LAG_S)
+        self.learned = False  # this tick has ended a segment that told something of the pump
         self._leak = film_health.LeakEstimate()
         self._setpoint_um = math.nan
         self._shaped_um = math.nan
@@ -79,6 +83,16 @@ class InnerLoop:
     def ramp_um(self) -> float:
         """Where the setpoint's ramp stands, without the trim; NaN before the first step."""
         return self._ramp.value_um
+
+    @property
+    def pump_known(self) -> pump_drift.PumpScale:
+        """The pump against its configured curve."""
+        return self._drift.known
+
+    @property
+    def pump_correction(self) -> float:
+        """The scale of the curve that is in use."""
+        return self._drift.correction
 
     @property
     def lag_um(self) -> float:
@@ -99,6 +113,7 @@ class InnerLoop:
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """Run one automatic tick; a reading that is not finite counts as missing (`stale`). `dt_s` must exceed 0."""
+        self.learned = False
         if not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
         before_um = self._measured.value
@@ -108,10 +123,16 @@ class InnerLoop:
         terms = self._pid.terms(error_um, rate_um_per_s)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
         wanted_um_per_s = terms.sum_um_per_s + weather_um_per_s + ramp_um_per_s
-        limited_um_per_s = self._limiter.limit(wanted_um_per_s, dt_s)
+        probing = self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
+        probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
+        limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
         self._pid.integrate(dt_s)
-        fraction = self._curve.command(limited_um_per_s, dt_s)
-        self._leak.update(self._curve.flow(fraction), weather_um_per_s, filtered_um, dt_s)
+        fraction = self._command(limited_um_per_s, dt_s)
+        if probing:
+            self.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
+        else:
+            self._drift.spoil()
+        self._leak.update(self._flow(fraction), weather_um_per_s, filtered_um, dt_s)
         return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
 
     def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
@@ -126,9 +147,10 @@ class InnerLoop:
             self._setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
         self._leak.pause()
+        self._spoil()
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
-        fraction = self._curve.command(self._limiter.flow_um_per_s, dt_s)
+        fraction = self._command(self._limiter.flow_um_per_s, dt_s)
         return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um)
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
@@ -146,9 +168,10 @@ class InnerLoop:
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
         placed_um_per_s = self._limiter.place(flow_um_per_s)
         self._pid.place(placed_um_per_s - weather_um_per_s)
-        fraction = self._curve.command(placed_um_per_s, dt_s)
+        self._spoil()
+        fraction = self._command(placed_um_per_s, dt_s)
         if seen:
-            self._leak.update(self._curve.flow(fraction), weather_um_per_s, self._measured.value, dt_s)
+            self._leak.update(self._flow(fraction), weather_um_per_s, self._measured.value, dt_s)
         else:
             self._leak.pause()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
@@ -157,12 +180,12 @@ class InnerLoop:
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
         """`follow` with a raw pump command, which is output unchanged; whether the pump runs is unknown."""
-        flow_um_per_s = self._curve.flow(fraction)
+        flow_um_per_s = self._flow(fraction)
         output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
         self._leak.pause()
         output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
-        return replace(output, flow_um_per_s=self._curve.flow(fraction), pump_fraction=fraction)
+        return replace(output, flow_um_per_s=self._flow(fraction), pump_fraction=fraction)
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take new settings without a bump in the flow."""
@@ -176,6 +199,17 @@ class InnerLoop:
         self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
         self._feedforward.set_gains(loop)
         self._pid.set_gains(_gains(loop))
+
+    def _command(self, flow_um_per_s: float, dt_s: float) -> float:
+        """Command for a flow, with what was learned of the pump."""
+        return self._curve.command(flow_um_per_s / self._drift.correction, dt_s)
+
+    def _flow(self, fraction: float) -> float:
+        return self._drift.correction * self._curve.flow(fraction)
+
+    def _spoil(self) -> None:
+        self.learned = False
+        self._drift.spoil()
 
     def _stand_at(self, setpoint_um: float) -> None:
         """Put everything that follows the setpoint to rest there."""
@@ -212,7 +246,7 @@ class InnerLoop:
             d_um_per_s=terms.d_um_per_s,
             feedforward_um_per_s=feedforward,
             flow_wanted_um_per_s=wanted,
-            flow_um_per_s=self._curve.flow(fraction),
+            flow_um_per_s=self._flow(fraction),
             pump_fraction=fraction,
             saturated=not 0.0 <= wanted <= self._limiter.flow_max_um_per_s,
             leak_um_per_s=self._leak.leak_um_per_s,

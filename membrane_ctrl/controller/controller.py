@@ -112,6 +112,8 @@ class Controller:
         if math.isnan(self._state_since_s):  # the verdict has just changed the state
             self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
         self._act(events)
+        if scene.loop.learned and self.state == State.HOLD:
+            events += self._consistency.told_of_pump(scene.loop)
         command = BenchCommand(scene.pump_fraction, scene.vent_fraction)
         scene.observer.wrote(command)
         scene.last_pump_fraction = scene.pump_fraction

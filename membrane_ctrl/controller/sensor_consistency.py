@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control import film, film_health, gas
+from membrane_ctrl.control import film, film_health, gas, inner_loop
 from membrane_ctrl.controller import safety_rules, tick
-from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility, PumpLearned
 from membrane_ctrl.model.states import State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
@@ -46,6 +46,7 @@ class SensorConsistency:
         self._plausibility = film.PlausibilityCheck(config.shape.disagreement_max_um)
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
+        self._pump = film_health.PumpHealth(config.pump.change_max)
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)
         self._growth = film.LeakGrowth()
         self._leak_growth_max = config.limits.leak_growth_max
@@ -78,8 +79,17 @@ class SensorConsistency:
         events = self._judge_weather(inputs, dt_s)
         events += self._judge(self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate))
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
-        for warning in self._health.step(dt_s, held.leak_um_per_s, gauge_pa):
-            events.append((Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message))
+        events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
+        return events
+
+    def told_of_pump(self, loop: inner_loop.InnerLoop) -> list[Event]:
+        """Events on what a segment of probing has told of the pump."""
+        report, warnings = self._pump.step(loop.pump_known)
+        events: list[Event] = [_of_warning(warning) for warning in warnings]
+        if report:
+            known = loop.pump_known
+            scales = (round(value, 4) for value in (known.scale, known.sigma, loop.pump_correction))
+            events.append(PumpLearned(*scales))
         return events
 
     def _rest(self) -> list[Event]:
@@ -133,3 +143,7 @@ class SensorConsistency:
             return []
         self._liar = liar
         return [Plausibility(liar.name.lower(), str(self._plausibility.changes))]
+
+
+def _of_warning(warning: film_health.FilmWarning) -> Event:
+    return (Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message)

@@ -127,6 +127,14 @@ class Maintenance(Event, kind="maintenance"):
     message: str
 
 
+class PumpLearned(Event, kind="pump"):
+    """What is known of the pump: its flow relative to the configured curve, one standard error, the scale in use."""
+
+    scale: float
+    sigma: float
+    correction: float
+
+
 class MaintenanceOver(Event, kind="maintenance_over"):
     """A maintenance notice no longer applies."""
 
@@ -153,6 +161,7 @@ _SENTENCES = {
     "agreement": "Laser and camera agree again[ ({seen})]",
     "maintenance": "Maintenance {name}: {message}",
     "maintenance_over": "Maintenance {name} is over: {message}",
+    "pump": "The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop reckons with {correction:.3f}",
     "link": "Link to the pump board: {message}",
     "latch_written": "The latched fault's file is written again",
     "child_ended": "The {child} process ended[ with exit code {exit_code}]; the hold continues",

@@ -25,7 +25,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unp
 
 _SCALARS = frozenset({NoneType, bool, int, float, str})
 _SEQUENCES: tuple[type, ...] = (tuple, list, set, frozenset)
-_DTYPES = frozenset({"<f8", "<f4", "<i8", "|b1"})
+_DTYPES = frozenset({"<f8", "<f4", "<c16", "<i8", "|b1"})
 _OURS = ("membrane_ctrl.", "firmware_iface.")
 _CLASS = ""  # the key of an object's class; no attribute has this name
 _INT_MAX = 2**63

@@ -105,13 +105,15 @@ _TICKS = "every tick around events, else one a second"
 
 
 def _loop(config: Config) -> rrb.Vertical:
+    learned = [_plot("Pump against its curve", streams.PUMP.path)] if config.pump.probe_um else []
     return rrb.Vertical(
         _around_band(config, f"Error and band, {_TICKS}, µm", "/loop/error", "/truth/error"),
         _plot("Setpoint, reading and true centre, µm", "/loop/position", "/truth/displacement"),
         _plot("P, I, D and feed-forward, µm/s", "/loop/terms"),
         _plot("Flow wanted, flow and leak, µm/s", "/loop/flow"),
         _plot("Pump and vent", "/pump/drive"),
-        row_shares=[3, 2, 2, 2, 2],
+        *learned,
+        row_shares=[3, 2, 2, 2, 2, *(2 for _ in learned)],
         name="Loop",
     )
 

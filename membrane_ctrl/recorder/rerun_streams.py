@@ -30,6 +30,11 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
     for stream, marks_s, values in streams.mark_lines(events):
         recording.scalars(stream.path, marks_s, values)
+    of_pump = [(at_s, event) for at_s, event in zip(time_s, events, strict=True) if event.get("kind") == "pump"]
+    if of_pump:
+        values = np.array([[event["scale"], event["correction"]] for _, event in of_pump])
+        squares = np.array([[event["sigma"] ** 2, 0.0] for _, event in of_pump])
+        recording.measurements(streams.PUMP.path, np.array([at_s for at_s, _ in of_pump]), values, squares)
 
 
 # Fewer rows for the viewer while nothing happens; every tick is in the other files (docs/recording.md).

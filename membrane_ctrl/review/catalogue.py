@@ -39,6 +39,8 @@ class RunEntry:
     faults_s: float = math.nan
     paused_s: float = math.nan
     moving_s: float = math.nan
+    pump_scale: float = math.nan  # flow against its configured curve as last learned, and one standard error
+    pump_sigma: float = math.nan
 
     @property
     def name(self) -> str:
@@ -101,6 +103,7 @@ def entry(folder: Path) -> RunEntry:
     config = run_folder.read_config(folder, notes)
     told, duration_s = summary.get("held"), _number(summary.get("duration_s"))
     held = told if isinstance(told, dict) else {}
+    pump = next((each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None)
     return RunEntry(
         folder=folder,
         started_utc=origin_of(folder, log),
@@ -117,6 +120,8 @@ def entry(folder: Path) -> RunEntry:
         kept=(folder / KEPT_FILE).exists(),
         geometry=next((e.event.hash for e in reversed(log) if isinstance(e.event, run_events.GeometryInForce)), ""),
         **{name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")},
+        pump_scale=math.nan if pump is None else _number(pump.scale),
+        pump_sigma=math.nan if pump is None else _number(pump.sigma),
     )
 
 

@@ -30,6 +30,8 @@ PROPERTIES = {
     "faults_share": "time in faults",
     "kp_per_s": "Kp, 1/s",
     "ti_s": "Ti, s",
+    "pump_scale": "pump / curve",
+    "pump_sigma": "±",
     "geometry": "geometry",
     "configuration": "configuration",
     "exit": "end",

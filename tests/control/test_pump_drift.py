@@ -1,0 +1,130 @@
+"""The pump's drift, on a bench of its own: a loop, a film and a weather that share no code with the product."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.control.film_health import PumpHealth
+from membrane_ctrl.control.pump_drift import PROBE_RAD_PER_S, SEGMENT_S, SIGMA_FIRST, PumpDrift, PumpScale
+
+DT_S = 0.2
+LASER_UM = 0.32  # as 1 um at 50 Hz
+
+
+@dataclass
+class Bench:
+    """A pump whose scale may drift, behind a dead time and a lag, under a PI loop."""
+
+    hours: float = 3.0
+    ends_at: float = 1.0  # scale at the end, in a straight line from `begins_at`
+    begins_at: float = 1.0
+    probe_um: float = 0.1
+    walk: float = 0.1  # um/sqrt(s), of the centre
+    gusts: float = 0.0  # um/s, one a minute
+    lift: float = 0.0  # um/s, a sine at the probe's own frequency
+    dead_steps: int = 0
+    seed: int = 1
+
+    def run(self) -> PumpDrift:
+        rng = np.random.default_rng(self.seed)
+        count = round(self.hours * 3600 / DT_S)
+        noise, walk, gusts = rng.standard_normal((3, count)).tolist()
+        blows = (rng.random(count) < DT_S / 60).tolist()
+        drift = PumpDrift(0.1, 0.15)
+        centre = seen = gust = 0.0
+        integral = arriving = 1.24
+        tube = [1.24] * self.dead_steps
+        for k in range(count):
+            share = k / count
+            scale = self.begins_at + (self.ends_at - self.begins_at) * share
+            reading = centre + LASER_UM * noise[k]
+            seen += 0.6 * (reading - seen)
+            integral -= 0.5 / 8 * seen * DT_S
+            flow = min(max(integral - 0.5 * seen + drift.flow_um_per_s(self.probe_um), 0.0), 5.3) / drift.correction
+            drift.step(reading, flow, DT_S)
+            tube.append(flow)
+            arriving += (1 - math.exp(-DT_S / 0.15)) * (tube.pop(0) - arriving)
+            gust = gust * math.exp(-DT_S / 2) + (self.gusts * gusts[k] if blows[k] else 0.0)
+            speed = scale * arriving - 1.24 + gust + self.lift * math.sin(PROBE_RAD_PER_S * k * DT_S)
+            centre += speed * DT_S + self.walk * math.sqrt(DT_S) * walk[k]
+        return drift
+
+
+@pytest.mark.parametrize(
+    "bench",
+    [
+        Bench(walk=0.0, seed=2),
+        Bench(gusts=3.0, seed=3),
+        Bench(lift=0.2, seed=4),
+        Bench(dead_steps=1, seed=5),
+        Bench(begins_at=1.3, ends_at=1.3, seed=6),
+    ],
+    ids=["noise alone", "gusts", "a lift in step", "a slow pump", "a wrong curve"],
+)
+def test_a_pump_that_does_not_drift_stays_within_its_error_bar(bench: Bench) -> None:
+    drift = bench.run()
+    known = drift.known
+    assert known.sigma < 0.12
+    assert abs(known.scale - bench.ends_at) < 2.5 * known.sigma
+    assert abs(drift.correction - 1.0) <= abs(bench.ends_at - 1.0) + 0.05
+
+
+def test_a_pump_that_loses_a_fifth_in_a_night_is_followed_and_told() -> None:
+    drift = Bench(hours=8.0, ends_at=0.8, seed=8).run()
+    assert drift.known.scale == pytest.approx(0.8, abs=2 * drift.known.sigma)
+    assert drift.correction < 0.95
+    assert [warning.bad for warning in PumpHealth(0.12).step(drift.known)[1]] == [True]
+
+
+@pytest.mark.campaign
+def test_most_nights_in_which_a_pump_loses_a_fifth_are_told_by_their_end() -> None:
+    found = [Bench(hours=8.0, ends_at=0.8, seed=seed).run().known for seed in range(7, 19)]
+    assert np.mean([known.scale for known in found]) == pytest.approx(0.8, abs=0.05)
+    assert np.mean([bool(PumpHealth(0.12).step(known)[1]) for known in found]) >= 0.75
+
+
+@pytest.mark.campaign
+def test_error_bars_cover_what_they_claim() -> None:
+    """At the end of 40 nights, in three sorts of weather."""
+    kinds = ({"walk": 0.0}, {}, {"gusts": 2.0}, {"ends_at": 0.9})
+    benches = [Bench(hours=4.0, seed=100 + n, **kinds[n % 4]) for n in range(40)]
+    found = [(bench.run().known, bench.ends_at) for bench in benches]
+    off = np.array([(known.scale - truth) / known.sigma for known, truth in found])
+    assert 0.6 < math.sqrt(float(np.mean(off**2))) < 1.3
+    assert np.mean(np.abs(off) < 2) >= 0.9
+
+
+def test_without_a_probe_nothing_is_learned() -> None:
+    drift = Bench(hours=1.0, probe_um=0.0, gusts=3.0).run()
+    assert drift.known.sigma > 0.9 * SIGMA_FIRST
+    assert drift.correction == 1.0
+
+
+def test_a_segment_with_a_gap_teaches_nothing() -> None:
+    drift = PumpDrift(0.1, 0.15)
+    for k in range(round(20 * SEGMENT_S / DT_S)):
+        if k % 200 == 0:
+            drift.spoil()
+        assert not drift.step(math.sin(0.1 * k), 1.24 + drift.flow_um_per_s(0.1), DT_S)
+    assert drift.known == PumpScale()
+
+
+def test_a_drift_is_told_once_and_so_is_its_end() -> None:
+    health = PumpHealth(change_max=0.15)
+    told = []
+    for scale in (1.0, 0.9, 0.84, 0.84, 0.86, 0.9, 0.95):
+        told += [(warning.bad, warning.message) for warning in health.step(PumpScale(scale, 0.04))[1]]
+    assert told == [
+        (True, "the pump gives 16 % less than its curve (+- 4 %): check it, then `tune pump`"),
+        (False, "no longer so"),
+    ]
+    assert PumpHealth(0.15).step(PumpScale(0.8, 0.1))[1] == ()  # may be noise
+
+
+def test_it_is_reported_every_ten_segments() -> None:
+    health = PumpHealth(0.15)
+    assert [health.step(PumpScale())[0] for _ in range(20)] == ([False] * 9 + [True]) * 2
