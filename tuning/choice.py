@@ -91,7 +91,9 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
 
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
-    folder = open_session(logs / "tuning" / gains_file.to_roll_back(logs).session if name is None else name)
+    if name is None:
+        name = logs / "tuning" / gains_file.to_roll_back(logs, gains_only=True).session
+    folder = open_session(name)
     gains = _kept(folder)
     config = toml_file.load(path, schema.Config)
     _require_same_bench(path, config, folder)
@@ -121,7 +123,8 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
     done = session.verified_of(folder)
     if not done.kept:
         raise InputError(f"{folder.path}: its gains were not kept: {done.reason}")
-    last = [line for line in gains_file.entries(folder.path.resolve().parents[1]) if line.session == folder.path.name]
+    noted = gains_file.entries(folder.path.resolve().parents[1])
+    last = [line for line in noted if line.session == folder.path.name and line.shape_s is None]
     if last and last[-1].what == "rolled_back":
         raise InputError(f"{folder.path}: its gains were rolled back on {last[-1].time_utc} ({last[-1].reason})")
     return done.after

@@ -3,6 +3,7 @@
 import contextlib
 import getpass
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -133,18 +134,19 @@ def map_pump(options: TuneOptions) -> int:
 
 
 def outer(options: TuneOptions) -> int:
-    """Measure sag sensitivity, noise and drift of the figure; propose the shape loop's time constant."""
+    """Measure sag sensitivity, noise and drift of the figure; try the shape loop's time constant that follows."""
     from membrane_ctrl.metrology.optics.hencky import zernike_projection
-    from tuning.identification.shape_loop import TYPICAL_S as OUTER_S
-    from tuning.identification.shape_loop import evaluate, step_experiment
+    from tuning.identification import shape_loop
 
+    assumed = zernike_projection()
     with _session(options) as (folder, rig, progress):
-        progress.begin("shape loop", OUTER_S + options.observe_s, 0.0)
+        before_s = folder.config.shape.time_constant_s
+        progress.begin("shape loop", shape_loop.TYPICAL_S + options.observe_s, options.verify_s)
         rig.hold(options.observe_s)
         steady = [shape for shape in rig.shapes if shape.verdict != "rejected"]
-        levels = step_experiment(rig, rig.loop.setpoint_um, folder.config.shape.enabled)
+        levels = shape_loop.step_experiment(rig, rig.loop.setpoint_um, folder.config.shape.enabled)
         try:
-            found = evaluate(levels, steady, zernike_projection())
+            found = shape_loop.evaluate(levels, steady, assumed)
         except ValueError as error:
             raise RejectedError(f"shape loop: {error}") from None
         plain.write(folder.file("outer.json"), found)
@@ -153,7 +155,36 @@ def outer(options: TuneOptions) -> int:
             f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
             f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
         )
-    return _concluded(folder, options)
+        if not _to_be_tried(shape_loop.unfit(found), found.time_constant_s, before_s, options, progress):
+            return _concluded(folder, options)
+        progress.begin("trial of the time constant", options.verify_s, 0.0)
+        earlier = [*steady, *(shape for level in levels for shape in level)]
+        times_s = (before_s, found.time_constant_s)
+        done = shape_loop.trial(rig, times_s, earlier, assumed, options.verify_s)
+        what: gains_file.What = "taken_back" if done.reason else "kept"
+        told_of = (folder.path.name, options.author, done.reason or options.reason, rig.loop, rig.loop, None, times_s)
+        gains_file.note(options.logs, gains_file.entry(what, *told_of))
+        plain.write(folder.file("outer_verified.json"), done)
+        progress.say(
+            f"taken back: {done.reason}"
+            if done.reason
+            else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} um (before "
+            f"{done.error_before_um:.2f} um); for the next hold set shape.time_constant_s = {done.after_s:.0f}"
+        )
+    code = _concluded(folder, options)
+    return Exit.REJECTED if done.reason else code
+
+
+def _to_be_tried(unfit: str, after_s: float, before_s: float, options: TuneOptions, progress: Progress) -> bool:
+    """Whether a time constant goes on trial: if it makes a difference, and a person or `--yes` wants it."""
+    if unfit:
+        raise RejectedError(f"shape loop: {unfit}")
+    if abs(after_s / before_s - 1) < 0.1:
+        progress.say(f"the present time constant, {before_s:.0f} s, fits")
+        return False
+    asked = not options.yes and sys.stdin.isatty()
+    answer = progress.ask(f"try it instead of {before_s:.0f} s? [y/N]") if asked else ""
+    return options.yes or answer.lower() in ("y", "yes")
 
 
 def watch(options: TuneOptions) -> int:
@@ -191,13 +222,16 @@ def rollback(options: TuneOptions) -> int:
     with _link(options) as link:
         rig = HoldRig(link, options.author, progress)
         try:
-            rig.set_gains(kept.before, f"rollback of {kept.session}: {options.reason}"[:250])
+            shape_s = kept.shape_s[0] if kept.shape_s else math.nan
+            rig.set_gains(kept.before, f"rollback of {kept.session}: {options.reason}"[:250], shape_s=shape_s)
         except HoldError as error:
             raise DeviceError(str(error)) from None
-    told = gains_file.entry("rolled_back", kept.session, options.author, options.reason, kept.before, kept.after)
+    told_of = (kept.session, options.author, options.reason, kept.before, kept.after, None, kept.shape_s)
+    told = gains_file.entry("rolled_back", *told_of)
     gains_file.note(options.logs, told)
     progress.say(
         f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti {kept.before.ti_s:g} s"
+        + (f", time constant of the shape loop {kept.shape_s[0]:.0f} s" if kept.shape_s else "")
     )
     for saved in {line.reason for line in gains_file.entries(options.logs) if line.what == "saved"}:
         progress.say(f"{saved} was saved with gains of a session: check its [loop]")
@@ -241,7 +275,7 @@ def _note_verified(folder: SessionFolder, logs: Path, why: str, again: bool = Fa
     name = folder.path.name
     if not folder.done("verify"):
         return
-    if not again and any(line.session == name for line in gains_file.entries(logs)):
+    if not again and any(line.session == name and line.shape_s is None for line in gains_file.entries(logs)):
         return
     done = session.verified_of(folder)
     what: gains_file.What = "kept" if done.kept else "taken_back"

@@ -140,6 +140,7 @@ class GainsEntry:
     before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
     after: LoopConfig
     traded: Traded | None = None
+    shape_s: tuple[float, float] | None = None  # time constant of the shape loop before and after, if that was tried
 
 
 def entry(
@@ -150,10 +151,11 @@ def entry(
     before: LoopConfig,
     after: LoopConfig,
     traded: Traded | None = None,
+    shape_s: tuple[float, float] | None = None,
 ) -> GainsEntry:
     """Return an entry stamped with the present time."""
     now_utc = datetime.now(UTC).isoformat(timespec="seconds")
-    return GainsEntry(now_utc, what, session, author, reason, before, after, traded)
+    return GainsEntry(now_utc, what, session, author, reason, before, after, traded, shape_s)
 
 
 def note(logs: Path, what: GainsEntry) -> None:
@@ -183,13 +185,17 @@ def entries(logs: Path) -> list[GainsEntry]:
     return found
 
 
-def to_roll_back(logs: Path) -> GainsEntry:
-    """The newest gains kept and not rolled back since. Raises InputError if there are none."""
-    undone: set[str] = set()
+def to_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
+    """The newest gains kept and not rolled back since. Raises InputError if there are none.
+
+    A time constant of the shape loop counts too, unless `gains_only`.
+    """
+    undone: set[tuple[str, bool]] = set()
     for found in reversed(entries(logs)):
+        of = (found.session, found.shape_s is None)
         if found.what == "rolled_back":
-            undone.add(found.session)
-        elif found.what == "kept" and found.session not in undone:
+            undone.add(of)
+        elif found.what == "kept" and of not in undone and (found.shape_s is None or not gains_only):
             return found
     raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
 
@@ -204,8 +210,12 @@ def history_table(found: list[GainsEntry]) -> str:
     for line in found:
         loop = line.before if line.what == "rolled_back" else line.after
         traded = (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
+        reason = line.reason
+        if line.shape_s is not None:
+            before_s, after_s = reversed(line.shape_s) if line.what == "rolled_back" else line.shape_s
+            reason = f"shape loop {before_s:.0f} -> {after_s:.0f} s: {reason}"
         lines.append(
             f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | {loop.kp_per_s:.3f} "
-            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | {line.reason} |"
+            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | {reason} |"
         )
     return "\n".join(lines)

@@ -133,11 +133,15 @@ class HoldRig:
 
     def hold(self, duration_s: float) -> Record:
         """Record the next seconds of hold. Raises HoldError if the mirror is not held throughout."""
-        return self.record([self._next_held() for _ in range(round(duration_s / self.dt_s))])
+        return self.record(self.ticks(duration_s))
+
+    def ticks(self, duration_s: float) -> list[telemetry.TelemetryRow]:
+        """As `hold`, but the ticks themselves."""
+        return [self._next_held() for _ in range(round(duration_s / self.dt_s))]
 
     def hold_about(self, duration_s: float) -> tuple[Record, Series]:
         """As `hold`, with each sample's setpoint in um, because the shape loop moves setpoint and mirror."""
-        rows = [self._next_held() for _ in range(round(duration_s / self.dt_s))]
+        rows = self.ticks(duration_s)
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])
         setpoints = np.interp(ticks[0] + np.arange(len(record)), ticks, [row.setpoint_um for row in rows])
@@ -169,9 +173,14 @@ class HoldRig:
         told = self._experiment_ended()
         return rows, machine.Finished(told.completed, told.reason)
 
-    def set_gains(self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan) -> None:
-        """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows."""
-        self._link.ask(Command("gains", self._who, why, value=trial_s, loop=loop))
+    def set_gains(
+        self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan, shape_s: float = math.nan
+    ) -> None:
+        """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
+
+        `shape_s`: time constant of the shape loop; NaN leaves it.
+        """
+        self._link.ask(Command("gains", self._who, why, value=trial_s, loop=loop, shape_time_constant_s=shape_s))
         self.loop = loop
 
     def keep(self) -> None:

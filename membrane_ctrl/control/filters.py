@@ -108,10 +108,10 @@ class Slope:
 
 
 class DriftTracker:
-    """Value and rate of a drift that is initially 0; T is `memory_s`."""
+    """Value and rate of a drift that is initially 0; T is `memory_s`, which may change."""
 
     def __init__(self, memory_s: float) -> None:
-        self._memory_s = memory_s
+        self.memory_s = memory_s
         self._time_s = math.nan
         self._value_um = 0.0
         self._rate_um_per_s = 0.0
@@ -126,12 +126,12 @@ class DriftTracker:
 
     def at(self, time_s: float) -> float:
         """Value in um expected at a time (not before the last reading's); a rate is believed for one memory."""
-        return self._value_um + self._rate_um_per_s * min(time_s - self._time_s, self._memory_s)
+        return self._value_um + self._rate_um_per_s * min(time_s - self._time_s, self.memory_s)
 
     def take(self, reading_um: float, time_s: float) -> None:
         """Take a reading, later than the last one, into the memory."""
         dt_s = time_s - self._time_s
-        beta = math.exp(-dt_s / self._memory_s)
+        beta = math.exp(-dt_s / self.memory_s)
         expected_um = self.at(time_s)
         residual_um = reading_um - expected_um
         self._value_um = expected_um + (1.0 - beta**2) * residual_um

@@ -135,6 +135,10 @@ class ShapeLoop:
         self._seen_s = math.nan
         self._settled_since_s = math.inf
 
+    def set_memory(self, time_constant_s: float) -> None:
+        """Set the tracker's memory; the trim does not jump."""
+        self._drift.memory_s = time_constant_s
+
     def switch(self, on: bool, now_s: float) -> None:
         """Switch on, taking a new reference from the present trim, or off, holding the trim."""
         if on and self._state == states.ShapeState.OFF:

@@ -61,6 +61,7 @@ class Request(Section):
     text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
+    shape_time_constant_s: float | None = None  # `gains`: of the shape loop
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
 
@@ -68,7 +69,7 @@ class Request(Section):
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         needs, takes = (rule.needs, rule.takes) if rule else ((), ())
-        for name in ("value", "text", "loop", "experiment"):
+        for name in ("value", "text", "loop", "experiment", "shape_time_constant_s"):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
                 raise ValueError(f"{self.do} takes no {name}")

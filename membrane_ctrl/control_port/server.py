@@ -213,9 +213,11 @@ class Port:
         experiment = (
             None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
         )
-        value = math.nan if request.value is None else request.value
+        value, shape_s = (
+            math.nan if number is None else number for number in (request.value, request.shape_time_constant_s)
+        )
         return commands.Command(
-            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers)
+            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s
         )
 
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:

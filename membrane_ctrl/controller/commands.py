@@ -19,6 +19,7 @@ Role = Literal["read", "operate", "tune"]
 AT_START = "command line"  # sender of the first commands
 AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
+MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 
 # Within one tick these come first, in this order: the safest wins
 DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
@@ -44,6 +45,7 @@ class Command:
     loop: LoopConfig | None = None  # `gains`: all new loop settings
     experiment: ExperimentSpec | None = None  # `tune`: the experiment
     number: int = 0  # chosen by the client, returned with the answer
+    shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,9 @@ TABLE: dict[Kind, CommandRule] = {
     "pause": CommandRule("operate", _HOLD, "Pause the loop; the pump keeps its mean flow."),
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
     "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in um/s of the centre.", needs=("value",)),
-    "gains": CommandRule("tune", RUNNING, "Set loop gains, on trial or to stay.", needs=("loop",), takes=("value",)),
+    "gains": CommandRule(
+        "tune", RUNNING, "Set gains, on trial or to stay.", needs=("loop",), takes=("value", "shape_time_constant_s")
+    ),
     "keep": CommandRule("tune", RUNNING, "Keep the gains on trial."),
     "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
     "shape_on": CommandRule("operate", ANY, "Switch the shape loop on."),
@@ -118,6 +122,9 @@ def refusal(command: Command, state: State, config: Config) -> str:
         return "gains: missing"
     if command.kind == "gains" and not (math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S):
         return f"gains on trial for {command.value:g} s: a trial takes 1 .. {TRIAL_MAX_S:g} s"
+    memory_s = command.shape_time_constant_s
+    if not (math.isnan(memory_s) or 1.0 <= memory_s <= MEMORY_MAX_S):
+        return f"shape.time_constant_s = {memory_s:g} s is outside 1 .. {MEMORY_MAX_S:g} s"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
         return "the tick rate cannot be changed during a run"
     if command.kind == "capture" and not config.shape.enabled:
@@ -132,8 +139,9 @@ class GainsTrial:
     (docs/decisions/78-gains-on-trial.md).
     """
 
-    def __init__(self, loop: LoopConfig) -> None:
+    def __init__(self, loop: LoopConfig, shape_time_constant_s: float) -> None:
         self._good = self._tried = loop
+        self._good_shape_s = self._tried_shape_s = shape_time_constant_s
         self._until_s = math.nan
 
     @property
@@ -141,16 +149,23 @@ class GainsTrial:
         """The present gains are not kept yet."""
         return math.isfinite(self._until_s)
 
-    def begin(self, loop: LoopConfig, now_s: float, trial_s: float) -> None:
+    def begin(self, loop: LoopConfig, now_s: float, trial_s: float, shape_time_constant_s: float = math.nan) -> None:
         """Set new gains for `trial_s` seconds, or permanently if that is NaN."""
         self._tried = loop
+        if math.isfinite(shape_time_constant_s):
+            self._tried_shape_s = shape_time_constant_s
         self._until_s = now_s + trial_s
         if not self.on_trial:
-            self._good = loop
+            self.keep()
+
+    @property
+    def shape_time_constant_s(self) -> float:
+        """The shape loop's time constant now in force."""
+        return self._tried_shape_s
 
     def keep(self) -> None:
         """Keep the present gains."""
-        self._good, self._until_s = self._tried, math.nan
+        self._good, self._good_shape_s, self._until_s = self._tried, self._tried_shape_s, math.nan
 
     def overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
@@ -158,5 +173,5 @@ class GainsTrial:
 
     def revert(self) -> LoopConfig:
         """Restore and return the last good gains."""
-        self._tried, self._until_s = self._good, math.nan
+        self._tried, self._tried_shape_s, self._until_s = self._good, self._good_shape_s, math.nan
         return self._good

@@ -51,7 +51,7 @@ class Controller:
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
         self._scene = Scene(config, config.loop, loop, observer, levels, standstill, config.loop.setpoint_um)
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
-        self._gains = commands.GainsTrial(config.loop)
+        self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s)
         self._consistency = sensor_consistency.SensorConsistency(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -159,10 +159,11 @@ class Controller:
             command=command.kind,
             who=command.who,
             why=command.why,
-            value=command.value if math.isfinite(command.value) else None,
+            value=_or_none(command.value),
             text=command.text or None,
             loop=None if command.loop is None else command.loop.model_dump(),
             experiment=None if command.experiment is None else command.experiment.model_dump(),
+            shape_time_constant_s=_or_none(command.shape_time_constant_s),
             refused=refused or None,
         )
         events.append(taken)
@@ -184,7 +185,7 @@ class Controller:
                 scene.setpoint_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
-                self._gains.begin(command.loop, scene.now_s, command.value)
+                self._gains.begin(command.loop, scene.now_s, command.value, command.shape_time_constant_s)
                 self._set_gains(command.loop)
             case "keep":
                 self._gains.keep()
@@ -230,6 +231,7 @@ class Controller:
     def _set_gains(self, loop: LoopConfig) -> None:
         self._scene.loop_config = loop
         self._scene.loop.set_gains(loop)
+        self._shape.set_memory(self._gains.shape_time_constant_s)
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
         self._set_gains(self._gains.revert())
@@ -343,3 +345,7 @@ class Controller:
         if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
             self._said_why = words
             events.append(told.Why(scene.why))
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None

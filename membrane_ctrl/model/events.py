@@ -95,6 +95,7 @@ class CommandTaken(Event, kind="command"):
     text: str | None = None
     loop: Any = None
     experiment: Any = None
+    shape_time_constant_s: float | None = None
     refused: str | None = None
 
 

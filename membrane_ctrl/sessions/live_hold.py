@@ -94,6 +94,8 @@ class LiveHold:
         request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
         if math.isfinite(command.value):
             request["value"] = command.value
+        if math.isfinite(command.shape_time_constant_s):
+            request["shape_time_constant_s"] = command.shape_time_constant_s
         if command.loop is not None:
             request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
         if command.experiment is not None:

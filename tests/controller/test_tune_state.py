@@ -14,7 +14,8 @@ from pydantic import ValidationError
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import Command, refusal
-from membrane_ctrl.controller.tick import TickAssembler, pack_tick, unpack_tick
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.events import EventLine
@@ -241,6 +242,33 @@ def test_a_fault_takes_gains_on_trial_back() -> None:
     held.bench.wrong.gauge_offset_pa = 500.0
     held.go(1.0)
     assert "fault" in held.of("gains_reverted")[-1]["why"]
+
+
+def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
+    controller = Controller(CONFIG, zernike_projection())
+    now_s = 0.0
+
+    def told(*commands: Command) -> tuple[list[str], float]:
+        nonlocal now_s
+        now_s += 5.0
+        out = controller.tick(TickInputs(now_s=now_s, dt_s=0.02, reading=None, commands=commands))
+        return [event.kind for event in out.events], controller._shape._drift.memory_s
+
+    def tried(shape_s: float, trial_s: float = math.nan) -> Command:
+        return replace(gains(CONFIG.loop.kp_per_s, trial_s), shape_time_constant_s=shape_s)
+
+    assert told(tried(90.0, 8.0))[1] == 90.0
+    kinds, memory_s = told()
+    assert ("gains_reverted" in kinds, memory_s) == (False, 90.0)
+    kinds, memory_s = told()
+    assert ("gains_reverted" in kinds, memory_s) == (True, 40.0)
+    told(tried(90.0, 8.0))
+    told(Command("keep", "tester"))
+    assert [told()[1] for _ in range(3)] == [90.0] * 3
+    assert told(gains(0.3))[1] == 90.0  # gains alone leave it
+    assert told(tried(60.0, 1.0))[1] == 60.0
+    assert told()[1] == 90.0
+    assert "outside" in refusal(tried(0.5), State.HOLD, CONFIG)
 
 
 def test_a_trial_of_no_time_is_refused() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.metrology.optics.hencky import zernike_projection
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import ShapeState
 from membrane_ctrl.sessions import folder as plain
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import PlantModel
 from tuning.identification.records import Record, load_record, save_record
-from tuning.identification.shape_loop import STEP_UM, evaluate
+from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
 from tuning.proposal.design import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
@@ -130,6 +132,71 @@ def test_a_drift_that_is_not_seen_asks_for_minutes() -> None:
     assert not found.drift_seen
     assert found.drift_um_per_sqrt_h < 2.0
     assert found.time_constant_s > 60.0
+
+
+class OuterRig:
+    """A hold whose shapes during the trial are given; notes what it is told."""
+
+    loop = LOOP
+
+    def __init__(self, trial: list[ShapeEstimate], tracking: float = 1.0) -> None:
+        self.shapes: list[ShapeEstimate] = []
+        self.told: list[tuple[float, float] | str] = []
+        self._trial, self._tracking = trial, tracking
+
+    def set_gains(self, loop: LoopConfig, why: str, trial_s: float, shape_s: float = math.nan) -> None:
+        self.told.append((trial_s, shape_s))
+
+    def keep(self) -> None:
+        self.told.append("keep")
+
+    def ticks(self, duration_s: float) -> list[SimpleNamespace]:
+        self.shapes += self._trial
+        codes = [ShapeState.TRACKING if k < 100 * self._tracking else ShapeState.SUSPENDED for k in range(100)]
+        return [SimpleNamespace(shape_state=code) for code in codes]
+
+
+@pytest.mark.parametrize(
+    ("after_s", "um_per_min", "tracking", "words"),
+    [
+        (60.0, 0.0, 1.0, ""),
+        (60.0, 1.0, 1.0, ""),
+        (600.0, 0.0, 1.0, ""),
+        (600.0, 1.0, 1.0, "the next shape is predicted to"),
+        (2.0, 0.0, 1.0, "the next shape is predicted to"),
+        (60.0, 0.0, 0.5, "tracked only 50% of the trial"),
+    ],
+)
+def test_a_time_constant_is_kept_if_it_predicts_the_shapes(
+    after_s: float, um_per_min: float, tracking: float, words: str
+) -> None:
+    drift_um = um_per_min / 60 * 2.0 * np.arange(400)
+    earlier = shapes(100, 0.0, 37_100.0, 0.3, drift_um[:100])
+    rig = OuterRig(shapes(300, 200.0, 37_100.0, 0.3, drift_um[100:]), tracking)
+    done = trial(rig, (40.0, after_s), earlier, zernike_projection(), 600.0)  # type: ignore[arg-type]
+    assert words in done.reason
+    assert bool(words) == bool(done.reason)
+    assert rig.told[0] == (720.0, after_s)
+    assert rig.told[1:] == (["keep"] if not words else [(1.0, pytest.approx(math.nan, nan_ok=True))])
+
+
+def test_a_figure_that_does_not_answer_the_setpoint_is_not_tuned_on() -> None:
+    still = np.zeros(400)
+    levels = [shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
+    found = evaluate(levels, shapes(400, 0.0, 37_100.0, 0.3, still), zernike_projection())
+    assert unfit(found) == ""
+    assert "calibrate the camera first" in unfit(replace(found, scale=0.7))
+    assert "calibrate the camera first" in unfit(replace(found, agreement=0.5))
+
+
+def test_a_rolled_back_time_constant_leaves_the_gains_of_its_session(tmp_path: Path) -> None:
+    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
+    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0)))
+    assert journal.to_roll_back(tmp_path).shape_s == (40.0, 62.0)
+    assert journal.to_roll_back(tmp_path, gains_only=True).shape_s is None
+    journal.note(tmp_path, journal.entry("rolled_back", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0)))
+    assert journal.to_roll_back(tmp_path).shape_s is None
+    assert "shape loop 62 -> 40 s" in journal.history_table(journal.entries(tmp_path))
 
 
 def gains_file(plant: PlantModel) -> GainsFile:

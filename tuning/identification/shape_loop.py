@@ -14,9 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.control.shape_loop import sag_change
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.states import ShapeState
 from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.records import Series
 from tuning.rig import HoldRig
@@ -76,6 +78,7 @@ STEP_UM = 5.0
 _LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle started earlier
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
 _LEAST_CYCLES = 8
+_SPARE_S, _BACK_S = 120.0, 1.0
 # Below ten cycles it would follow the noise; beyond an hour the drift is unknown.
 _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 
@@ -131,11 +134,9 @@ def evaluate(
     sensitivity = (means[1] - (means[0] + means[2]) / 2) / step_um
     scatter = np.mean([np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels], axis=0)
     shapes = sorted((*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s)
-    reference = shapes[0]
-    seen = (sag_change(s.coeffs_um, reference.coeffs_um, s.covariance_um2, assumed).change_um for s in shapes)
-    gaps_um = np.array([sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)])
-    cycle_s = float(np.median(np.diff([shape.time_s for shape in shapes])))
-    noise = fit_local_level(gaps_um, np.array([shape.time_s for shape in shapes]))
+    times_s, gaps_um = _gaps(shapes, assumed)
+    cycle_s = float(np.median(np.diff(times_s)))
+    noise = fit_local_level(gaps_um, times_s)
     best_s = noise.white * math.sqrt(cycle_s / noise.walk)
     kept, wanted = sensitivity[1:], assumed[1:]
     return ShapeLoopFit(
@@ -149,3 +150,80 @@ def evaluate(
         drift_seen=noise.seen,
         time_constant_s=min(max(best_s, _CYCLES_MIN * cycle_s), _TAU_MAX_S),
     )
+
+
+def _gaps(shapes: Sequence[ShapeEstimate], assumed: Series) -> tuple[Series, Series]:
+    """Times, and change of sag less laser reading: the drift between the two and the noise of a cycle."""
+    first = shapes[0]
+    seen = (sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um for s in shapes)
+    gaps_um = np.array([sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)])
+    return np.array([shape.time_s for shape in shapes]), gaps_um
+
+
+# The trial of a time constant. The drift does not depend on the trim, so that both trackers can be run on the very
+# shapes of the trial: what differs is the tracker alone, and no weather has to be compared.
+
+GROWTH_MAX = 1.1  # of the error with which the next shape is predicted
+_TRACKING_LEAST = 0.9  # of the trial
+_APART_MAX = 0.2  # of the figure's response: beyond it the camera sees something else than the sag
+
+
+@dataclass(frozen=True, slots=True)
+class OuterTrial:
+    """`outer_verified.json`: the verification of a time constant of the shape loop."""
+
+    before_s: float
+    after_s: float
+    error_before_um: float  # rms prediction error of each tracker on the shapes of the trial
+    error_um: float
+    tracking: float  # share of the trial in which the shape loop tracked
+    reason: str  # why it is taken back; empty if it is kept
+
+
+def trial(
+    rig: HoldRig, times_s: tuple[float, float], earlier: Sequence[ShapeEstimate], assumed: Series, duration_s: float
+) -> OuterTrial:
+    """Hold with the second time constant; keep it if it predicts the shapes as well as the first, the present one.
+
+    `earlier` shapes let both trackers settle. If the session ends, or is killed, the hold takes it back by itself.
+    """
+    before_s, after_s = times_s
+    why = "shape loop: time constant"
+    rig.set_gains(rig.loop, why, duration_s + _SPARE_S, after_s)
+    begun = len(rig.shapes)
+    rows = rig.ticks(duration_s)
+    during = [shape for shape in rig.shapes[begun:] if shape.verdict != "rejected"]
+    tracking = float(np.mean([row.shape_state == ShapeState.TRACKING for row in rows]))
+    gaps = _gaps([*earlier, *during], assumed)
+    error_before_um, error_um = (_predicted(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s))
+    reason = ""
+    if len(during) < _LEAST_CYCLES or tracking < _TRACKING_LEAST:
+        reason = f"the shape loop tracked only {tracking:.0%} of the trial, with {len(during)} shapes"
+    elif error_um > GROWTH_MAX * error_before_um:
+        reason = f"the next shape is predicted to {error_um:.2f} um, by the former one to {error_before_um:.2f} um"
+    if reason:
+        rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)  # over at once: the hold takes its own one back
+    else:
+        rig.keep()
+    return OuterTrial(before_s, after_s, error_before_um, error_um, tracking, reason)
+
+
+def unfit(found: ShapeLoopFit) -> str:
+    """Why a time constant must not be tried; empty if it may be."""
+    if found.agreement < 1 - _APART_MAX or abs(found.scale - 1) > _APART_MAX:
+        return (
+            f"the figure answers the setpoint by {found.scale:.2f} of what is assumed (direction "
+            f"{found.agreement:.2f}): calibrate the camera first"
+        )
+    return ""
+
+
+def _predicted(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> float:
+    """Rms error with which a tracker predicts the last gaps, each from those before it."""
+    tracker = DriftTracker(memory_s)
+    tracker.begin(float(times_s[0]))
+    errors_um: list[float] = []
+    for time_s, gap_um in zip(times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True):
+        errors_um.append(gap_um - tracker.at(time_s))
+        tracker.take(gap_um, time_s)
+    return float(np.sqrt(np.mean(np.square(errors_um[-last:])))) if last else math.nan
