@@ -6,7 +6,7 @@ _.model_config, _.nullable_schema, _.field_title_should_be_set  # pydantic
 _.num_tickets  # ssl
 acquisition_main, alarms_main, console_main, recorder_main  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
-_.effective_samples  # written to the report by `asdict`
+_.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
 Camera  # the role that the camera drivers fill
 _.geometry_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
 _.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.sensitivity_sigma  # parts of a result
