@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,6 +37,10 @@ VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")
 YesOption = Annotated[bool, typer.Option("--yes", help="Apply the proposal without asking.")]
 ChooseOption = Annotated[str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")]
 PageOption = Annotated[bool, typer.Option("--page", help="With `run`: serve a live page on localhost.")]
+ShortOption = Annotated[
+    bool, typer.Option("--short", help="Short form: five minutes of experiments, five of verification.")
+]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Wait until the mirror is held.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
 
@@ -76,6 +81,8 @@ def _step(name: str) -> None:
         choose: ChooseOption = "",
         json: JsonOption = False,
         page: PageOption = False,
+        short: ShortOption = False,
+        wait: WaitOption = False,
     ) -> int:
         from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
@@ -92,12 +99,14 @@ def _step(name: str) -> None:
             reason=reason,
             limit_um=limit_um,
             observe_s=clock.parse_duration_s(observe),
-            verify_s=clock.parse_duration_s(verify),
+            verify_s=min(clock.parse_duration_s(verify), 300.0 if short else math.inf),
             take_over=take_over,
             yes=yes,
             choose=choose,
             json=json,
             page=page,
+            short=short,
+            wait=wait,
         )
         return _run(name, options)
 

@@ -19,7 +19,7 @@ from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, 
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
 from membrane_ctrl.sessions.live_log import LiveLog
 from tuning import choice, gains_file, report, session, twin_hold
-from tuning.identification.characterise import TYPICAL_S
+from tuning.identification.characterise import FULL, SHORT, Plan
 from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S
 from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
 from tuning.rig import HoldRig
@@ -49,6 +49,13 @@ class TuneOptions:
     choose: str
     json: bool
     page: bool = False
+    short: bool = False
+    wait: bool = False
+
+    @property
+    def plan(self) -> Plan:
+        """Of the experiments."""
+        return SHORT if self.short else FULL
 
     @property
     def stages(self) -> tuple[tuple[float, float], ...]:
@@ -247,7 +254,7 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
         )
 
     moving: dict[str, Callable[[HoldRig], object]] = {
-        "characterise": lambda r: session.characterise_step(folder, r, options.limit_um),
+        "characterise": lambda r: session.characterise_step(folder, r, options.limit_um, options.plan),
         "observe": lambda r: session.observe_step(folder, r, options.observe_s),
         "apply": lambda r: session.apply_step(folder, r),
         "verify": lambda r: _verify(folder, r, options, told),
@@ -330,8 +337,8 @@ def _gains_words(loop: LoopConfig) -> str:
 
 def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
     planned = {
-        "characterise": TYPICAL_S,
-        "observe": options.observe_s,
+        "characterise": options.plan.typical_s,
+        "observe": 0.0 if options.short else options.observe_s,
         "verify": SETTLE_LEAST_S + options.verify_s,
     }
     progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
@@ -373,7 +380,7 @@ def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
 
 def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
     if not options.twin:
-        return live_hold(options.where, options.take_over)
+        return live_hold(options.where, options.take_over, wait=options.wait)
     config = open_session(options.session).config if options.session is not None else options.config
     try:
         return contextlib.closing(twin_hold.TwinHold(config))

@@ -22,6 +22,7 @@ from tuning.proposal import candidates, design, prediction, trade, verify
 from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
+_HELD = "held.npz"  # the quiet hold of a short session, recorded before the experiments
 _PREVIEW_SEEDS = 3
 # Time to check the applied gains and start the verification; then they revert automatically.
 _APPLY_S = 900.0
@@ -78,15 +79,17 @@ class Verified:
 
 
 def characterise_step(
-    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
+    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0, plan: characterise.Plan = characterise.FULL
 ) -> characterise.Experiments:
     """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes."""
     session.begin("characterise")
     try:
-        done = characterise.experiment(rig, limit_um)
+        done = characterise.experiment(rig, limit_um, plan)
     except (characterise.ExperimentError, ValueError) as error:
         raise errors.RejectedError(f"characterise: {error}") from None
     records.save_record(session.file("experiments.npz"), done.record)
+    if plan is characterise.SHORT and done.held is not None:
+        records.save_record(session.file(_HELD), done.held)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
     folder.write(session.file("experiments.json"), head)
     return done
@@ -123,10 +126,11 @@ def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
 
 
 def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
-    """Observe a quiet hold: laser noise and weather."""
+    """Observe a quiet hold, in a short session the one before its experiments: laser noise and weather."""
     model = found_of(session).identified.model
     session.begin("observe")
-    record = rig.hold(duration_s)
+    held = session.file(_HELD)
+    record = records.load_record(held) if held.exists() else rig.hold(duration_s)
     try:
         disturbance = observe(record, model, rig.loop)
     except ValueError as error:

@@ -49,6 +49,10 @@ def hold(
     ] = False,
     standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
     from_flat: FlatOption = False,
+    autotune: Annotated[
+        bool,
+        typer.Option("--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."),
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop."""
@@ -67,6 +71,7 @@ def hold(
         clear_faults=clear_faults,
         json=json,
         standby=standby,
+        autotune=autotune,
         lab=devices is not None,
     )
     with errors.named(devices or config):

@@ -9,8 +9,10 @@ import contextlib
 import gc
 import json
 import math
+import os
 import shlex
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -36,6 +38,8 @@ from membrane_ctrl.processes import child, ring
 from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
 
+_NICE, _ENDS_S = 10, 10.0  # of the tuning session
+
 
 @dataclass(frozen=True, slots=True)
 class HoldOptions:
@@ -50,6 +54,7 @@ class HoldOptions:
     clear_faults: bool
     json: bool
     standby: bool = False  # wait for `ctl hold`
+    autotune: bool = False  # a short tuning session once the mirror is held
     lab: bool = False  # the twin answers as the instruments of the configuration, not as the pump board
 
 
@@ -91,6 +96,8 @@ def hold_mirror(options: HoldOptions) -> int:
         )
         terminal.progress(f"run folder {run_dir}; starting {', '.join(children.names)}")
         children.start(stack)
+        if options.autotune:
+            stack.callback(_autotune(listeners.path, run_dir))
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(server.Port, config.port, listeners, run_dir.name)
         latch = partial(FaultLatch, latched, resumes, run_dir.name, clock.utc)
@@ -99,6 +106,29 @@ def hold_mirror(options: HoldOptions) -> int:
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
         report(run_dir, options.json)
     return exit_code
+
+
+def _autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
+    """Start a tuning session, which waits for the hold, on trial; returns how to end it.
+
+    It is another program, as if a person had started it: a hold needs no tuner, and outlives it.
+    """
+    words = ["--short", "--wait", "--choose", "same-load", "--name", "autotune", "--reason", "hold --autotune"]
+    where = ["--socket", str(socket), "--run", str(run_dir), "--logs", str(run_dir.parent)]
+    program = [sys.executable, "-m", "membrane_ctrl", "tune", "run", *words, *where]
+    with (run_dir / "autotune.log").open("wb") as log:
+        process = subprocess.Popen(program, stdin=subprocess.DEVNULL, stdout=log, stderr=log, process_group=0)
+    os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
+
+    def end() -> None:
+        process.terminate()
+        try:
+            process.wait(_ENDS_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    return end
 
 
 def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fault.LatchedFile | None:

@@ -88,7 +88,7 @@ FORMAT = "membrane-session/1"
 STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
 # The results of a step; the first file marks it as done.
 FILES: dict[str, tuple[str, ...]] = {
-    "characterise": ("experiments.json", "experiments.npz"),
+    "characterise": ("experiments.json", "experiments.npz", "held.npz"),
     "identify": ("identified.json",),
     "observe": ("disturbance.json", "quiet.npz"),
     "design": ("gains.toml", "proposal.json", "candidates.md"),

@@ -63,6 +63,8 @@ class HoldLink(Protocol):
 
 
 _NEWS_S = 0.2
+_STARTS_S = 120.0  # from its command line to its control port
+_POLL_S = 1.0
 _SILENT_S = 5.0  # after this long without a tick, the run has ended or hangs
 
 
@@ -140,11 +142,19 @@ class LiveHold:
 
 
 @contextlib.contextmanager
-def live_hold(where: Where, take_over: bool, needs_operate: str = "") -> Iterator[LiveHold]:
-    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role is read."""
+def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool = False) -> Iterator[LiveHold]:
+    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role is read.
+
+    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before.
+    """
     socket = socket_path(where)
+    until_s = time.monotonic() + (_STARTS_S if wait else 0.0)
+    while wait and not socket.exists() and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
     client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
     try:
+        while wait and client.ask(do="status")["status"].get("state") != "hold":
+            time.sleep(_POLL_S)
         if needs_operate and client.greeting["role"] == "read":
             raise errors.InputError(f"{needs_operate} needs the role operate; {client.greeting['you']} has read")
         link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over)

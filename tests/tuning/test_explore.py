@@ -9,6 +9,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import control
 import numpy as np
@@ -27,6 +28,7 @@ from tuning import gains_file, session
 from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
 from tuning.explore.page import saver
 from tuning.identification import disturbance, loop_model, records
+from tuning.identification.characterise import SHORT
 from tuning.proposal import design
 from tuning.rig import Rig
 
@@ -124,6 +126,17 @@ def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Pa
     assert found.proposed == loop_model.Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
     opened.begin("design")
     assert of_path(opened.path, tmp_path).proposed is None
+
+
+def test_a_short_session_takes_the_weather_from_before_its_experiments(template: Path, tmp_path: Path) -> None:
+    """The hold is not asked for more."""
+    opened = copy_of(template, tmp_path)
+    before = session.disturbance_of(opened)
+    shutil.copy(opened.file("quiet.npz"), opened.file("held.npz"))
+    assert session.observe_step(opened, SimpleNamespace(loop=LOOP)) == before  # type: ignore[arg-type]
+    assert SHORT.typical_s == pytest.approx(300.0, abs=1.0)
+    opened.begin("characterise")
+    assert not opened.file("held.npz").exists()
 
 
 def test_a_run_gives_its_weather_and_says_whose_plant_it_is(template: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from membrane_ctrl.control.experiments import machine, trial
+from tuning.identification.disturbance import SLOWEST_S
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
@@ -104,15 +105,32 @@ def _bent(record: Record, identified: Identified) -> list[str]:
     return [f"{what} ({gains}): run the pump map and set [pump] from it"]
 
 
-_RELAYS_MAX, _DOUBLETS_MAX = 4, 4
 _GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma
 _DEAD_TIME_SIGMA_S = 0.025  # within 0.05 s at 2 sigma
-_SETTLE_S, _QUIET_S, _BETWEEN_S = 20.0, 40.0, 15.0
-_RELAY_S, _DOUBLETS_S = 120.0, 60.0
+_BETWEEN_S = 15.0
 _VALIDATE_LEAST_S = 10.0
 
-# One relay and one round of doublets, with the holds between: enough for most benches.
-TYPICAL_S = _SETTLE_S + _QUIET_S + _RELAY_S + _DOUBLETS_S + 2 * _BETWEEN_S
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How long the parts of the experiments last, and how often they are repeated at most."""
+
+    settle_s: float = 20.0
+    quiet_s: float = 40.0
+    relay_s: float = 120.0
+    relays: int = 4
+    doublets_s: float = 60.0
+    doublets: int = 4
+
+    @property
+    def typical_s(self) -> float:
+        """With one relay and one round of doublets, enough for most benches."""
+        return self.settle_s + self.quiet_s + self.relay_s + self.doublets_s + 2 * _BETWEEN_S
+
+
+FULL = Plan()
+# Five minutes; its quiet hold is long enough to know the weather from
+SHORT = Plan(settle_s=0.0, quiet_s=2.0 * SLOWEST_S + 1.0, relay_s=45.0, relays=2, doublets_s=24.0, doublets=1)
 
 
 class ExperimentRig(Protocol):
@@ -140,6 +158,7 @@ class Experiments:
     relays_s: float  # duration of the relays with the holds after them
     pulses_s: tuple[float, float]  # start and end of the longest doublets
     finished: machine.Finished  # how the last relay ended
+    held: Record | None = None  # the hold before them; None if read from a file
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +193,7 @@ def characterise(rig: ExperimentRig, limit_um: float = 10.0) -> Characterised:
     return fitted(experiment(rig, limit_um))
 
 
-def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
+def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) -> Experiments:
     """Hold, relay and doublets on a rig that holds its mirror.
 
     A stopped relay is discarded and repeated: the fit does not model whatever stopped it. Stopped doublets are
@@ -183,21 +202,23 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0) -> Experiments:
     Raises ExperimentError if no relay could be completed; ValueError if the pump has no room about the holding flow:
     the mirror is too tight or too leaky.
     """
-    rig.hold(_SETTLE_S)
-    around = rig.around(rig.hold(_QUIET_S), limit_um)
+    if plan.settle_s:
+        rig.hold(plan.settle_s)
+    held = rig.hold(plan.quiet_s)
+    around = rig.around(held, limit_um)
     machine.room(around)  # without room a relay would only report that it was stopped
-    relays, finished = _relays(rig, around)
+    relays, finished = _relays(rig, around, plan)
     gain = identify(relays).model.gain
     whole = relays
     longest_s = (relays.duration_s, relays.duration_s)
-    for _ in range(_DOUBLETS_MAX):
-        latest, _ = rig.perform(spec_of("doublets", around, _DOUBLETS_S, gain))
+    for _ in range(plan.doublets):
+        latest, _ = rig.perform(spec_of("doublets", around, plan.doublets_s, gain))
         if latest.duration_s > longest_s[1] - longest_s[0]:
             longest_s = (whole.duration_s, whole.duration_s + latest.duration_s)
         whole = whole.followed_by(latest, rig.hold(_BETWEEN_S))
         if identify(whole).sigma.dead_time_s <= _DEAD_TIME_SIGMA_S:
             break
-    return Experiments(around, whole, relays.duration_s, longest_s, finished)
+    return Experiments(around, whole, relays.duration_s, longest_s, finished, held)
 
 
 def fitted(done: Experiments) -> Characterised:
@@ -211,12 +232,12 @@ def fitted(done: Experiments) -> Characterised:
     return Characterised(done, found, judge(done.record, found, checked))
 
 
-def _relays(rig: ExperimentRig, around: machine.Around) -> tuple[Record, machine.Finished]:
+def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Record, machine.Finished]:
     """Relays until the gain is known, each followed by a hold."""
     done: Record | None = None
     finished = machine.Finished(False, "")
-    for _ in range(_RELAYS_MAX):
-        relay, finished = rig.perform(spec_of("relay", around, _RELAY_S))
+    for _ in range(plan.relays):
+        relay, finished = rig.perform(spec_of("relay", around, plan.relay_s))
         between = rig.hold(_BETWEEN_S)
         if not finished.completed:
             done = None
