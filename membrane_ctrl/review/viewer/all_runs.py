@@ -88,7 +88,9 @@ class RunCatalogue:
     def _lay_out(self) -> None:
         """One layout for the table, one for every run."""
         columns = [Column("recording link", name="run")]
-        columns += [Column(f"property:run:{name}", name=heading) for name, heading in PROPERTIES.items()]
+        learned = any(entry.pump_scale == entry.pump_scale for entry in self._entries)
+        shown = {name: words for name, words in PROPERTIES.items() if learned or not name.startswith("pump_")}
+        columns += [Column(f"property:run:{name}", name=heading) for name, heading in shown.items()]
         hidden = [Column(f"property:RecordingInfo:{name}", visible=False) for name in ("name", "start_time")]
         started = SortBy("property:run:started_utc", direction="Descending")
         table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
