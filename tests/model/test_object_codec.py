@@ -155,7 +155,7 @@ def changed(**values: object) -> Any:
         {"counts": {"x": "1"}},
         {"colour": "GREEN"},
         {"colour": "__class__"},
-        {"values": {"dtype": "<c16", "shape": [1], "data": "AAAAAAAAAAAAAAAAAAAAAA=="}},
+        {"values": {"dtype": "<c8", "shape": [1], "data": "AAAAAAAAAAA="}},
         {"values": {"dtype": "<f8", "shape": [2], "data": "AAAAAAAAAAA="}},
         {"values": {"dtype": "<f8", "shape": [1, 1, 1], "data": "AAAAAAAAAAA="}},
         {"values": {"dtype": "<f8", "shape": [2**62], "data": ""}},
