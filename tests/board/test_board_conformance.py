@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import shutil
 import socket
 import subprocess
@@ -12,7 +14,11 @@ import pytest
 
 from firmware_iface.board_settings import record
 from firmware_iface.conformance import Conformance, examine
+from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.roles import BenchCommand
 from tests.board.build_board import built
+from tests.board.film_wire import FilmWire
+from tests.board.still_film import StillFilm
 from tests.board.virtual_board import SETTINGS, VirtualBoard, VirtualLink
 
 _FINDINGS = 21
@@ -101,3 +107,30 @@ def test_a_client_that_is_not_ours_reads_and_stops(host_board: dict[str, str], l
     assert "0x0000" in polled(37)
     assert "Written 1 references" in polled(72, "0x0001")
     assert "0x0004" in polled(37)
+
+
+@pytest.mark.real_time
+async def test_the_host_program_has_a_film(host_program: Path, tmp_path: Path) -> None:
+    film = StillFilm()
+    wire = FilmWire(film)
+    await wire.start()
+    settings = tmp_path / "settings.bin"
+    settings.write_bytes(record(SETTINGS))
+    process = await asyncio.create_subprocess_exec(
+        str(host_program), str(settings), str(wire.port), stdout=asyncio.subprocess.PIPE
+    )
+    assert process.stdout is not None
+    words = (await process.stdout.readline()).decode().split()
+    driver = PumpBoard(f"tcp://127.0.0.1:{words[3]}", timeout_s=2.0, watchdog_s=10.0)
+    await driver.open()
+    while math.isnan((reading := await driver.read()).gauge_pressure_pa):
+        continue
+    assert (reading.displacement_um, reading.gauge_pressure_pa, reading.gas_temperature_c) == (12.5, 100.0, 22.0)
+    await driver.write(BenchCommand(0.5, 0.25))
+    await film.until(lambda: (film.pump, film.vent) == (0.5, 0.25))
+    film.gauge_pressure_pa = 801.0
+    await film.until(lambda: (film.pump, film.vent) == (0.0, 1.0))
+    await driver.close()
+    process.terminate()
+    await process.wait()
+    await wire.stop()
