@@ -15,7 +15,7 @@ from tests.support.review_runs import written
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "notebooks"
-NAMES = ("measure", "tune", "review")
+NAMES = ("measure", "library", "tune", "review")
 _TIMEOUT_S = 600
 
 
