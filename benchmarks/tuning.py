@@ -119,7 +119,7 @@ def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, 
     }
 
 
-def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
+def session(case: Case, seed: int, rules: bool = False, judge_s: float = VERIFY_S) -> dict[str, float]:
     """A whole session on one twin, then the true centre in fresh weather; with `rules` also textbook gains."""
     bench, before = TwinBench(case, seed), case.loop()
     rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
@@ -142,7 +142,7 @@ def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
         "ms": proposal.chosen.margins.ms,
         "degraded": float(done.quality.verdict == "degraded"),
     }
-    figures |= achieved("ours", proposal.loop, case, seed, least_um)
+    figures |= achieved("ours", proposal.loop, case, seed, least_um, judge_s)
     figures["predicted_over_achieved"] = figures["predicted_um"] / figures["ours_um"]
     if rules:
         dt_s = 1 / before.rate_hz
@@ -152,14 +152,15 @@ def session(case: Case, seed: int, rules: bool = False) -> dict[str, float]:
             ("amigo", amigo(found.model, dt_s, 0.2)),
             ("zn", ziegler_nichols(*relay_ultimate(found.model, dt_s))),
         ):
-            figures |= achieved(name, gains.applied_to(before) if gains else before, case, seed, least_um)
+            loop = gains.applied_to(before) if gains else before
+            figures |= achieved(name, loop, case, seed, least_um, judge_s)
     return figures
 
 
-def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float) -> dict[str, float]:
-    """True centre under a loop in weather that no session saw."""
+def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float, judge_s: float) -> dict[str, float]:
+    """True centre under a loop in weather that no session saw; 600 s scatter by 2 to 6 %, an hour by 1 to 2 %."""
     bench = TwinBench(case, 1000 + seed)
-    Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + VERIFY_S)
+    Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + judge_s)
     true_um = np.array(bench.true_um)[round(SETTLE_S * loop.rate_hz) :]
     std_um = float(true_um.std())
     return {f"{name}_um": std_um, f"{name}_bias_um": float(-true_um.mean()), f"{name}_ratio": std_um / least_um}
@@ -193,13 +194,13 @@ def summary(rows: Iterable[dict[str, float]]) -> dict[str, dict[str, float]]:
     return found
 
 
-def run(seeds: int = 16) -> dict[str, Any]:
+def run(seeds: int = 16, judge_s: float = VERIFY_S) -> dict[str, Any]:
     """All figures over `seeds` twins a case."""
     chosen = range(1, seeds + 1)
     return {
         "cases": {name: asdict(case) for name, case in (SESSIONS | PLANTS).items()},
         "sessions": {
-            name: summary(session(case, seed, rules=name == "typical, 1 um") for seed in chosen)
+            name: summary(session(case, seed, name == "typical, 1 um", judge_s) for seed in chosen)
             for name, case in SESSIONS.items()
         },
         "plants": {name: summary(identified(case, seed) for seed in chosen) for name, case in PLANTS.items()},
@@ -251,4 +252,6 @@ def _worst(figure: dict[str, float]) -> float:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=16)
-    _print(run(parser.parse_args().seeds))
+    parser.add_argument("--judge-s", type=float, default=VERIFY_S)
+    options = parser.parse_args()
+    _print(run(options.seeds, options.judge_s))

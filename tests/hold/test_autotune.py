@@ -56,6 +56,25 @@ def test_a_hold_tunes_itself(tmp_path: Path) -> None:
         verified = json.loads(found[0].read_text())
         assert verified["kept"] or verified["reason"]
         assert hold.poll() is None
+        _killed_and_resumed(tmp_path)
+        assert hold.poll() is None
     finally:
         hold.terminate()
         hold.wait(60.0)
+
+
+def _killed_and_resumed(logs: Path) -> None:
+    """Another session on the same hold is killed once it has identified, and goes on from there."""
+    words = [sys.executable, "-m", "membrane_ctrl", "tune", "run", "--short", "--yes", "--logs", str(logs)]
+    where = ["--socket", str(logs / "control.sock"), "--run", str(next(logs.glob("*-hold")))]
+    session = subprocess.Popen([*words, *where, "--name", "killed"], stderr=subprocess.DEVNULL)
+    give_up_s = time.monotonic() + 900.0
+    while not (found := list((logs / "tuning").glob("*-killed/identified.json"))):
+        assert time.monotonic() < give_up_s
+        time.sleep(0.2)
+    session.kill()
+    session.wait()
+    kept = {path.name: path.stat().st_mtime_ns for path in found[0].parent.glob("*.npz")}
+    subprocess.run([*words, *where, "--resume", str(found[0].parent)], check=False, timeout=900, capture_output=True)
+    assert (found[0].parent / "verified.json").exists()
+    assert (found[0].parent / "experiments.npz").stat().st_mtime_ns == kept["experiments.npz"]
