@@ -69,6 +69,7 @@ class InnerLoop:
         self._curve = gas.PumpCurve(pump)
         self._probe_um = pump.probe_um
         self._drift = pump_drift.PumpDrift(DEAD_S, PUMP_LAG_S)
+        self.may_probe = True  # not while gains are judged
         self.learned = False  # this tick has ended a segment that told something of the pump
         self._leak = film_health.LeakEstimate()
         self._setpoint_um = math.nan
@@ -123,7 +124,9 @@ class InnerLoop:
         terms = self._pid.terms(error_um, rate_um_per_s)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
         wanted_um_per_s = terms.sum_um_per_s + weather_um_per_s + ramp_um_per_s
-        probing = self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
+        probing = (
+            self.may_probe and self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
+        )
         probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
         self._pid.integrate(dt_s)

@@ -146,6 +146,7 @@ class Controller:
                 obeyed.add(command.kind)
         if self._gains.overdue(scene.now_s):
             self._revert_gains("nobody kept them in time", events)
+        scene.loop.may_probe = not self._gains.on_trial
 
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""

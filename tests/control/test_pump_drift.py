@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.film_health import PumpHealth
+from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.pump_drift import PROBE_RAD_PER_S, SEGMENT_S, SIGMA_FIRST, PumpDrift, PumpScale
 
 DT_S = 0.2
@@ -128,3 +130,19 @@ def test_a_drift_is_told_once_and_so_is_its_end() -> None:
 def test_it_is_reported_every_ten_segments() -> None:
     health = PumpHealth(0.15)
     assert [health.step(PumpScale())[0] for _ in range(20)] == ([False] * 9 + [True]) * 2
+
+
+def commands(probe_um: float, may_probe: bool) -> list[float]:
+    """Of the real loop, at its target in noise."""
+    loop = InnerLoop(LoopConfig(), PumpConfig(probe_um=probe_um))
+    loop.may_probe = may_probe
+    loop.start(0.0, 1.24)
+    noise = np.random.default_rng(3).standard_normal(200).tolist()
+    return [loop.step(LoopInput(0.0, 0.0, reading, math.nan, math.nan), 0.02).pump_fraction for reading in noise]
+
+
+def test_the_loop_probes_only_if_it_is_asked_to_and_may() -> None:
+    still = commands(0.0, may_probe=True)
+    assert commands(0.1, may_probe=False) == still
+    moved = np.array(commands(0.1, may_probe=True)) - still
+    assert 0.3 < 5.3 / 0.9 * np.abs(moved).max() / (0.1 * PROBE_RAD_PER_S) < 1.2
