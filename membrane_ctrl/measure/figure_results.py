@@ -71,9 +71,10 @@ def measured_figure(
     seen = full.map()
     if np.count_nonzero(np.isfinite(seen.height_mm)) < LEAST_CELLS:
         return None
-    found = FigureOf(seen, aperture)(seen)
-    of_noise = figure_bars(seen, aperture, mirror.radius_mm, bars.noise, bars.cell_slope)
-    of_geometry = figure_bars(seen, aperture, mirror.radius_mm, bars.geometry)
+    evaluate = FigureOf(seen, aperture)
+    found = evaluate(seen)
+    of_noise = figure_bars(evaluate, seen, found, mirror.radius_mm, bars.noise, bars.cell_slope)
+    of_geometry = figure_bars(evaluate, seen, found, mirror.radius_mm, bars.geometry)
     spectrum = power_spectrum(found, seen.axis_mm, aperture)
     return MeasuredFigure(found, of_noise, of_geometry, spectrum, seen, aperture, nominal_radius_mm)
 

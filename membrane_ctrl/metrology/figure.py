@@ -6,8 +6,8 @@ Definitions: ISO 10110-5 and ISO 14999-4 for irregularity, its rotationally inva
 Opt. Eng. 48, 043605 (2009) for PVr. They are applied to the surface, not to a wavefront.
 """
 
-from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
@@ -34,6 +34,11 @@ class SurfaceMap:
         """Every `stride`-th cell along both axes."""
         every = slice(None, None, stride)
         return SurfaceMap(self.axis_mm[every], *(a[every, every] for a in astuple(self)[1:]))
+
+    def plus(self, change: FloatArray) -> "SurfaceMap":
+        """With another height and slopes (3, n, n) added."""
+        now = self.height_mm + change[0], self.slope_x + change[1], self.slope_y + change[2]
+        return SurfaceMap(self.axis_mm, *now)
 
     def points(self) -> FloatArray:
         """Rows (3, cells) x, y, z of the measured cells in mm."""
@@ -89,7 +94,7 @@ class FigureOf:
     """
 
     def __init__(self, seen: SurfaceMap, aperture_mm: float) -> None:
-        self._aperture_mm = aperture_mm
+        self.aperture_mm = aperture_mm
         self._mask = np.isfinite(seen.height_mm)
         axis = seen.axis_mm / aperture_mm
         self.fringe = zernike.GridFit(axis, self._mask, _FRINGE)
@@ -119,7 +124,7 @@ class FigureOf:
         numbers = Quantities(
             radius_mm,
             radius_mm / 2,
-            sphere.sag_mm(self._aperture_mm),
+            sphere.sag_mm(self.aperture_mm),
             1e6 * sphere.tilt_x,
             1e6 * sphere.tilt_y,
             float(np.ptp(deviation)),
@@ -189,6 +194,7 @@ def _spot(sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray) ->
 
 _TRIALS = 32  # 1 sigma to 12 %
 _TRIAL_CELLS = 96  # a side, at least
+_WHITE_TRIALS = 4  # on every cell: a mean over thinned cells would be too noisy; to 35 %
 _TILE = 256  # cells
 _EDGE = 0.03  # of the rays, on either side
 _FIT_CYCLES = 4.0  # over the aperture: slower waves belong to the fit
@@ -203,9 +209,14 @@ class FigureBars:
 
 
 def figure_bars(
-    seen: SurfaceMap, aperture_mm: float, disc_mm: float, covariance_mm2: FloatArray, cell_slope: float = 0.0
+    evaluate: FigureOf,
+    seen: SurfaceMap,
+    found: Figure,
+    disc_mm: float,
+    covariance_mm2: FloatArray,
+    cell_slope: float = 0.0,
 ) -> FigureBars:
-    """1 sigma of a figure.
+    """1 sigma of a figure `found` = `evaluate(seen)`.
 
     Parameters
     ----------
@@ -222,25 +233,21 @@ def figure_bars(
     if not np.isfinite(covariance_mm2).all():
         nothing = Quantities(*[np.nan] * len(fields(Quantities)))
         return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
-    evaluate = FigureOf(thin, aperture_mm)
+    rough = FigureOf(thin, evaluate.aperture_mm)
     random = np.random.default_rng(1)  # the same set has the same error bars
     values, vectors = np.linalg.eigh(covariance_mm2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     modes = np.stack([surface.Surface.from_parameters(k, disc_mm).on_grid(thin.axis_mm) for k in root.T])
-    white = _white(seen, thin, aperture_mm, cell_slope, random)
-    nominal = evaluate(thin)
+    nominal = rough(thin)
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
-        change = np.tensordot(random.normal(size=len(root)), modes, axes=1) + white()
-        moved = replace(
-            thin,
-            height_mm=thin.height_mm + change[0],
-            slope_x=thin.slope_x + change[1],
-            slope_y=thin.slope_y + change[2],
-        )
-        squares += _change(nominal, evaluate(moved)) ** 2
-    terms = np.stack([1e3 * evaluate.fringe.coefficients(mode[0]) for mode in modes])
-    return FigureBars(Quantities(*np.sqrt(squares / _TRIALS)), np.sqrt(np.sum(terms**2, axis=0)))
+        change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
+        squares += _change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
+    for change in _white(seen, evaluate.aperture_mm, cell_slope, random) if cell_slope > 0 else ():
+        moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
+        squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
+    terms = np.stack([1e3 * rough.fringe.coefficients(mode[0]) for mode in modes])
+    return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms**2, axis=0)))
 
 
 def _change(nominal: Figure, moved: Figure) -> FloatArray:
@@ -253,11 +260,11 @@ def _change(nominal: Figure, moved: Figure) -> FloatArray:
 
 
 def _white(
-    seen: SurfaceMap, thin: SurfaceMap, aperture_mm: float, cell_slope: float, random: np.random.Generator
-) -> Callable[[], FloatArray]:
-    """Draws what white noise of the cells' slopes does to height and slopes, (3, n, n) on the thinned grid.
+    seen: SurfaceMap, aperture_mm: float, cell_slope: float, random: np.random.Generator
+) -> Iterator[FloatArray]:
+    """What white noise of the cells' slopes does to height and slopes, (3, n, n).
 
-    Integrated once on a periodic tile of whole cells, of which each draw takes another place.
+    Integrated once on a periodic tile of cells, of which each draw takes another place.
     """
     step = float(seen.axis_mm[1] - seen.axis_mm[0])
     k = 2 * np.pi * np.fft.fftfreq(_TILE, step)
@@ -268,14 +275,9 @@ def _white(
     fast = square > (np.pi * _FIT_CYCLES / aperture_mm) ** 2
     height = np.where(fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0)
     tiles = np.stack([np.fft.ifft2(height).real, *slopes])
-    places = np.round((thin.axis_mm - thin.axis_mm[0]) / step).astype(np.int64)
-
-    def draw() -> FloatArray:
-        down, right = random.integers(_TILE, size=2)
-        rows, columns = (places + down) % _TILE, (places + right) % _TILE
-        return np.asarray(tiles[:, rows[:, None], columns])
-
-    return draw
+    for _ in range(_WHITE_TRIALS):
+        down, right = np.arange(seen.axis_mm.size) + random.integers(_TILE, size=(2, 1))
+        yield tiles[:, (down % _TILE)[:, None], right % _TILE]
 
 
 @dataclass(frozen=True)

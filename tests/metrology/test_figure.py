@@ -39,6 +39,12 @@ def of(surface_map: figure.SurfaceMap) -> figure.Figure:
     return figure.FigureOf(surface_map, APERTURE)(surface_map)
 
 
+def bars_of(some: figure.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0) -> figure.FigureBars:
+    """Its error bars."""
+    evaluate = figure.FigureOf(some, APERTURE)
+    return figure.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
+
+
 def ball(radius_mm: float, tilt_x: float = 0.0, tilt_y: float = 0.0) -> np.ndarray:
     """Height of a sphere whose normal at the vertex is tilted."""
     normal = np.array([-tilt_x, -tilt_y, 1.0]) / np.sqrt(1 + tilt_x**2 + tilt_y**2)
@@ -174,7 +180,7 @@ def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
     true = replace(bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(36)[[4, 5, 6, 9]].sum(axis=0))
     evaluate = figure.FigureOf(seen(true.height(X, Y)), APERTURE)
     nominal = np.array(astuple(evaluate(seen(true.height(X, Y))).numbers))
-    bars = figure.figure_bars(seen(true.height(X, Y)), APERTURE, 500.0, root @ root.T)
+    bars = bars_of(seen(true.height(X, Y)), root @ root.T)
     off = []
     for _ in range(40):
         moved = surface.Surface.from_parameters(true.parameters + root @ random.normal(size=3), 500.0)
@@ -187,13 +193,13 @@ def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
 
 
 def test_noise_of_cells_alone_widens_the_pv_of_a_perfect_sphere() -> None:
-    noisy = figure.figure_bars(seen(ball(3400.0)), APERTURE, 500.0, np.zeros((36, 36)), 5e-6)
+    noisy = bars_of(seen(ball(3400.0)), np.zeros((36, 36)), 5e-6)
     step_um = 1e3 * float(AXIS[1] - AXIS[0])
     assert 0.1 * step_um < noisy.numbers.irregularity_pv_um / 5e-6 < 20 * step_um
 
 
 def test_a_covariance_that_is_unknown_gives_no_error_bar() -> None:
-    bars = figure.figure_bars(seen(ball(3400.0)), APERTURE, 500.0, np.full((36, 36), np.nan))
+    bars = bars_of(seen(ball(3400.0)), np.full((36, 36), np.nan))
     assert np.isnan(astuple(bars.numbers)).all()
     assert np.isnan(bars.fringe_um).all()
 
@@ -207,5 +213,5 @@ def test_a_figure_of_any_part_of_a_mirror(part: np.ndarray) -> None:
     height = np.where(part & INSIDE, ball(3400.0), np.nan)
     some = figure.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
     assert of(some).numbers.radius_of_curvature_mm == pytest.approx(3400, rel=1e-6)
-    bars = figure.figure_bars(some, APERTURE, 500.0, 1e-12 * np.eye(36), 1e-6)
+    bars = bars_of(some, 1e-12 * np.eye(36), 1e-6)
     assert np.isfinite(astuple(bars.numbers)).all()
