@@ -27,8 +27,11 @@ OPTICS = OpticsConfig(camera=SMALL)
 
 
 @cache
-def _hencky_solution():  # type: ignore[no-untyped-def]
-    """n, n' and the integral of rho / n, from rho = 0 (series) to 1, for the n(0) that meets the rim's condition."""
+def film_solution(ring_strain: float = 0.0, poisson: float = 0.3):  # type: ignore[no-untyped-def]
+    """n, n' and the integral of rho / n, from rho = 0 (series) to 1, for the n(0) that meets the rim's condition.
+
+    `ring_strain` is the pre-strain over q^(2/3).
+    """
 
     def slope(rho: float, y: FloatArray) -> list[float]:
         n, dn, _ = y
@@ -41,14 +44,14 @@ def _hencky_solution():  # type: ignore[no-untyped-def]
 
     def rim(centre: float) -> float:
         n, dn, _ = shoot(centre).y[:, -1]
-        return float(dn + 0.7 * n)
+        return float(dn + (1 - poisson) * n - ring_strain)
 
-    return shoot(brentq(rim, 0.38, 0.6, xtol=1e-15), True)
+    return shoot(brentq(rim, 0.36, 30.0, xtol=1e-15), True)
 
 
-def hencky_depth(rho: FloatArray) -> FloatArray:
+def hencky_depth(rho: FloatArray, ring_strain: float = 0.0, poisson: float = 0.3) -> FloatArray:
     """Profile of unit sag at rho, from the differential equation."""
-    solution = _hencky_solution()
+    solution = film_solution(ring_strain, poisson)
     out = solution.sol(np.clip(rho, 1e-3, 1))[2]
     centre = solution.sol(1e-3)[2]
     return np.where(rho < 1e-3, centre * (rho / 1e-3) ** 2, out) / solution.y[2, -1]
