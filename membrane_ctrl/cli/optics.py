@@ -9,9 +9,10 @@ from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetA
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `export-figure`, `uncertainty`, `stability`, `simulate`."""
+    """Add `measure`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
     app.command()(measure)
     app.command()(export_figure)
+    app.command()(film)
     app.command()(uncertainty)
     app.command()(stability)
     app.command()(simulate)
@@ -50,6 +51,24 @@ def export_figure(
     from membrane_ctrl.measure.export_figure import export_command
 
     return export_command(result, form, remove, zernike, out)
+
+
+def film(
+    folders: Annotated[list[Path], typer.Argument(metavar="SET...", help="Capture sets at different pressures.")],
+    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the sets' own.")] = None,
+    gauge_offset_pa: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero.")] = 1.0,
+    gauge_scale: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of its scale, relative.")] = 1e-3,
+    gauge_noise_pa: Annotated[float, typer.Option(min=0.01, help="Noise of a set's mean reading, Pa.")] = 0.3,
+    out: Annotated[Path | None, typer.Option(help="Output folder; film, beside the first set, by default.")] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw film.png next to the result.")] = True,
+    json: JsonOption = False,
+) -> int:
+    """Determine the film's pre-strain, Poisson ratio and stiffness from sets at several pressures."""
+    from membrane_ctrl.measure.film import FilmOptions, film_command
+    from membrane_ctrl.metrology.film_fit import Gauge
+
+    gauge = Gauge(gauge_noise_pa, gauge_offset_pa, gauge_scale)
+    return film_command(FilmOptions(tuple(folders), geometry, gauge, out, json, pictures))
 
 
 def uncertainty(

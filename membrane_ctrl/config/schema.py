@@ -57,6 +57,12 @@ class TwinConfig(Section):
     """Noise of the barometer. Change it to your barometer's."""
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
     """Noise of the air thermometer. Change it to your thermometer's."""
+    film_prestrain: Annotated[float, Field(ge=-0.01, le=0.1)] = 0.0
+    """Strain of the flat film before it was clamped, in its pictures. Change it to try `film` and `calibrate`."""
+    film_poisson: Annotated[float, Field(ge=0, le=0.5)] = 0.3
+    """Poisson ratio of the film, in its pictures. Change it to try `film` and `calibrate`."""
+    film_stiffness_n_per_m: Annotated[float, Field(ge=1, le=1e9)] = 2.05e5
+    """Modulus times thickness of the film, for the pressure that `simulate` states. Change it to try `film`."""
     geometry: GeometryConfig | None = None  # true camera and screen poses; none: those of [optics.geometry]
 
 

@@ -50,6 +50,7 @@ class CaptureFile(Section):
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
     kind: Literal["full", "fringes"]
     reference: str | None = None
+    pressure_pa: Annotated[float, Field(gt=0, le=1e5)] | None = None
     pattern: schema.PatternConfig
     geometry: schema.GeometryConfig
     camera: schema.CameraConfig
@@ -70,6 +71,7 @@ class CaptureHead:
     patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
     time_s: FloatArray  # (frames,): NaN where not stated
     displacement_um: FloatArray  # (frames,)
+    pressure_pa: float  # gauge pressure during the set; NaN where not stated
     ignored: tuple[str, ...]  # unknown keys of the file
     geometry: GeometryOrigin  # origin of the geometry in `optics`
 
@@ -135,6 +137,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         patterns=tuple(pattern for _, pattern in rows),
         time_s=_column([row.time_s for row, _ in rows]),
         displacement_um=_column([row.displacement_um for row, _ in rows]),
+        pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
         geometry=origin_of(optics) if geometry is None else geometry.origin,
     )

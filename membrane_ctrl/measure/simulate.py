@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, OpticsConfig
@@ -55,10 +55,12 @@ def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     """The set described by the options. Raises ValueError naming an impossible one."""
     optics = _optics(options)
     radius_mm = optics.mirror.radius_mm
-    mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed)
+    twin = options.config.twin
+    mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson)
     return simulation_spec.SimulationSpec(
         optics,
-        mounted if options.figure else film_shape.FilmShape(options.sag_mm, radius_mm),
+        mounted if options.figure else replace(mounted, zernike_um=()),
+        stiffness_n_per_m=twin.film_stiffness_n_per_m,
         motion=options.motion,
         laser_noise_um=options.laser_noise_um,
         stated_geometry=None if options.stated is None else read_geometry(options.stated).geometry,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 from scipy.optimize import brentq
 
 from membrane_ctrl.model.arrays import FloatArray
@@ -73,6 +74,62 @@ def solve(poisson: float = POISSON_PET) -> Hencky:
     fall = slope / (k + 1)
     profile = np.concatenate(([0.0], fall)) / fall.sum()
     return Hencky(float(fall.sum()) / 4, float(np.dot(k + 1, profile[1:] / (k + 2))), profile)
+
+
+# A film that was stretched before it was clamped, or is of another material: by collocation, for its pictures.
+#
+# With N in units of E t, q = p a / (E t) and the depth in radii, on u in [0, 1]:
+#
+#     4 u N'' + 8 N' + q^2 / (8 N^2) = 0,   2 N'(1) + (1 - nu) N(1) = prestrain,   depth = integral of q / (4 N).
+
+_DEGREE = 28
+_PROFILE_DEGREE = 18  # exact to the last bit; powers of u lose digits beyond
+
+
+@cache
+def stretched(depth: float, prestrain: float, poisson: float) -> tuple[float, FloatArray]:
+    """Load q and profile of a film: element k of the profile multiplies u^k, height for a depth of 1.
+
+    Raises ValueError if the film would be slack at its ring.
+    """
+    nodes, weights = chebyshev.chebgauss(_DEGREE)[0], np.polynomial.legendre.leggauss(_DEGREE)
+    places = np.concatenate([nodes, weights[0], [1.0]])
+    table = chebyshev.chebvander(places, _DEGREE)
+    slope = 2 * chebyshev.chebval(places, chebyshev.chebder(np.eye(_DEGREE + 1))).T
+    bend = 4 * chebyshev.chebval(nodes, chebyshev.chebder(np.eye(_DEGREE + 1), 2)).T
+    u = (nodes[:, None] + 1) / 2
+    at, inside, rim = slice(_DEGREE), slice(_DEGREE, -1), 2 * slope[-1] + (1 - poisson) * table[-1]
+    force = np.zeros(_DEGREE + 1)
+    force[0] = depth**2 + max(prestrain, 0.0) / (1 - poisson)
+    q = 4 * depth * force[0]
+    linear = 4 * u * bend + 8 * slope[at]
+    for _ in range(50):
+        n, fall = table @ force, weights[1] / 8  # of q / N
+        residual = np.concatenate(
+            [
+                linear @ force + q**2 / (8 * n[at] ** 2),
+                [rim @ force - prestrain, q * fall @ (1 / n[inside]) - depth],
+            ]
+        )
+        matrix = np.zeros((_DEGREE + 2, _DEGREE + 2))
+        matrix[:-2, :-1] = linear - (q**2 / (4 * n[at] ** 3))[:, None] * table[at]
+        matrix[:-2, -1] = q / (4 * n[at] ** 2)
+        matrix[-2, :-1] = rim
+        matrix[-1, :-1], matrix[-1, -1] = -q * (fall / n[inside] ** 2) @ table[inside], fall @ (1 / n[inside])
+        step = np.linalg.solve(matrix, -residual)
+        # a film stays taut on the way: no step takes more than half of its force
+        step *= min(1.0, 0.5 / float(np.max(np.abs(table @ step[:-1] / n))))
+        force, q = force + step[:-1], q + float(step[-1])
+        if np.max(np.abs(step)) < 1e-16:
+            break
+    if (table @ force)[_DEGREE:].min() < 0.2 * force[0]:
+        raise ValueError(f"prestrain = {prestrain:g}: the film would be slack at its ring")
+    fall_of_u = Chebyshev.interpolate(
+        lambda v: q / (4 * chebyshev.chebval(2 * v - 1, force)), _PROFILE_DEGREE, domain=[0, 1]
+    )
+    return q, np.asarray(
+        (fall_of_u.integ(lbnd=0) / depth).convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
+    )
 
 
 RADIUS_MM = 500.0

@@ -28,6 +28,7 @@ from numpy.polynomial import polynomial as series
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 SLACKEST = 21.0  # the series' last term is then below 1e-12; a slacker film wrinkles at its ring
+_USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 600 Pa
 _SERIES_TERMS = 80
 _TERMS = 14  # of a disturbance: it converges tenfold a term
 _NODES = 48
@@ -67,7 +68,8 @@ def _slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> Flo
 
     Raises ValueError if a film would be slack at its ring.
     """
-    s = np.full(np.shape(wanted), 1e-15)
+    usual = np.all(falls(np.asarray(_USUAL)) > wanted)
+    s = np.full(np.shape(wanted), _USUAL if usual else 1e-15)
     for _ in range(80):
         value = falls(s + 1j * _COMPLEX_STEP)
         step = (wanted - value.real) / (value.imag / _COMPLEX_STEP)
@@ -96,7 +98,10 @@ class FilmLaw:
 
     def under(self, pressure_pa: FloatArray | float) -> "Bowl":
         """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its ring."""
-        load = np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m
+        return self.loaded(np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m)
+
+    def loaded(self, load: FloatArray) -> "Bowl":
+        """The film under a load q. Raises ValueError as `under`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
         return Bowl(_slackness(lambda s: _ring_strain(s, self.poisson), wanted), load, self.poisson, self.radius_mm)
 

@@ -109,7 +109,8 @@ class OpticsRenderer:
     def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
-        return trace(self._camera_pose, directions, self.film.terms, sag_mm, vertex_z_mm, self._screen_pose)
+        film = self.film.terms_at(displacement_um)
+        return trace(self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose)
 
     def _nodes(self, displacement_um: float) -> FloatArray:
         """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the nearest three)."""
@@ -177,7 +178,7 @@ class TwinOptics:
         film: FilmShape | None = None,
     ) -> None:
         self._optics = optics if twin.geometry is None else optics.model_copy(update={"geometry": twin.geometry})
-        self._seed = twin.seed
+        self._twin, self._seed = twin, twin.seed
         self._truth = truth
         self._clock = clock
         self._film = film
@@ -209,7 +210,8 @@ class TwinOptics:
         if self._renderer is None:
             position = self._truth()
             sag_mm = position.sag_mm - position.displacement_um / 1000.0
-            film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed)
+            material = self._twin.film_prestrain, self._twin.film_poisson
+            film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed, *material)
             stated = self._optics.geometry.reference_displacement_um
             reference_um = position.displacement_um if stated is None else stated
             self._renderer = OpticsRenderer(self._optics, film, reference_um=reference_um, seed=self._seed)

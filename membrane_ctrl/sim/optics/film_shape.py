@@ -218,6 +218,9 @@ class FilmShape:
     sag_mm: float  # depth of the bowl (rim above vertex, without the other terms) at displacement 0
     radius_mm: float = 500.0
     bowl: Literal["hencky", "paraboloid"] = "hencky"
+    # of a Hencky bowl: strain of the flat film before it was clamped, and the material's Poisson ratio
+    prestrain: float = 0.0
+    poisson: float = gas_film.POISSON_PET
     # Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect)
     zernike_um: tuple[float, ...] = ()
     ripples: tuple[Ripple, ...] = ()
@@ -236,15 +239,29 @@ class FilmShape:
             raise ValueError("zernike_um: every value must be a number")
         if len(self.zernike_um) > MAX_ZERNIKE:
             raise ValueError(f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_ZERNIKE} are known")
+        if not 0 <= self.poisson <= 0.5:
+            raise ValueError(f"poisson = {self.poisson:g} is outside 0 .. 0.5")
         object.__setattr__(self, "terms", _terms(self))
 
     def sag_at_mm(self, displacement_um: float) -> float:
         """Depth of the bowl at a displacement (positive: deeper)."""
         return self.sag_mm + displacement_um / 1000.0
 
+    def terms_at(self, displacement_um: float) -> FilmTerms:
+        """The film as numbers at a displacement, where a stretched film has a profile of its own."""
+        if self.bowl == "paraboloid" or (self.prestrain, self.poisson) == (0.0, gas_film.POISSON_PET):
+            return self.terms
+        return self.terms._replace(bowl=self.load_and_bowl(displacement_um)[1])
+
+    def load_and_bowl(self, displacement_um: float) -> tuple[float, FloatArray]:
+        """Load p a / (E t) of a Hencky film at a displacement, and its profile as `FilmTerms.bowl`."""
+        return gas_film.stretched(self.sag_at_mm(displacement_um) / self.radius_mm, self.prestrain, self.poisson)
+
     def height_mm(self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float = 0.0) -> FloatArray:
         """Height above the vertex at points of any (equal) shape."""
-        flat = heights(self.terms, self.sag_at_mm(displacement_um), np.ravel(x_mm), np.ravel(y_mm))
+        flat = heights(
+            self.terms_at(displacement_um), self.sag_at_mm(displacement_um), np.ravel(x_mm), np.ravel(y_mm)
+        )
         return np.reshape(flat, np.shape(x_mm))
 
     def coeffs_um(self, displacement_um: float = 0.0) -> FloatArray | None:
@@ -288,7 +305,9 @@ def _terms(film: FilmShape) -> FilmTerms:
     return raised._replace(offset_mm=vertex_mm)
 
 
-def typical_film(sag_mm: float, radius_mm: float, seed: int) -> FilmShape:
+def typical_film(
+    sag_mm: float, radius_mm: float, seed: int, prestrain: float = 0.0, poisson: float = gas_film.POISSON_PET
+) -> FilmShape:
     """A mounted film: a Hencky bowl with the figure errors of clamping by hand.
 
     0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the seed,
@@ -301,4 +320,5 @@ def typical_film(sag_mm: float, radius_mm: float, seed: int) -> FilmShape:
         coeffs_um[sine - 1], coeffs_um[cosine - 1] = amplitude_um * sin(angle), amplitude_um * cos(angle)
     higher = rng.normal(size=MAX_ZERNIKE - 10)
     coeffs_um[10:] = 10.0 * higher / sqrt(float(np.dot(higher, higher)))
-    return FilmShape(sag_mm, radius_mm, zernike_um=tuple(float(c) for c in coeffs_um))
+    figure = tuple(float(c) for c in coeffs_um)
+    return FilmShape(sag_mm, radius_mm, prestrain=prestrain, poisson=poisson, zernike_um=figure)

@@ -31,6 +31,8 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
     table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": spec.kind}
     if spec.reference:
         table["reference"] = spec.reference
+    if spec.film.bowl == "hencky" and spec.film.sag_mm > 0:
+        table["pressure_pa"] = spec.pressure_pa(_mean_um(spec))
     table |= {
         "pattern": _written(spec.optics.pattern),
         "geometry": geometry,
@@ -55,8 +57,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     `truth.json`: the same numbers without the maps, and the request.
     """
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
-    fringes = np.array([pattern.role == "sin" for pattern in spec.patterns])
-    mean_um = float(displacement_um[fringes].mean())
+    mean_um = _mean_um(spec)
     coeffs_um = spec.film.coeffs_um(mean_um)
     radius_mm = spec.film.radius_mm
     axis_mm = np.linspace(-radius_mm, radius_mm, _GRID)
@@ -83,6 +84,12 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         "seed": spec.seed,
     }
     (folder / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+def _mean_um(spec: SimulationSpec) -> float:
+    """Mean displacement of the sinusoids."""
+    fringes = [spec.displacement_um(k) for k, pattern in enumerate(spec.patterns) if pattern.role == "sin"]
+    return float(np.mean(fringes))
 
 
 def _written(section: settings.Section) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.sim import film as gas_film
 from membrane_ctrl.sim.optics import film_shape, shade, trace
 
 # Faults of single frames on a real bench, for simulated sets.
@@ -98,6 +99,8 @@ class SimulationSpec:
     exact: bool = False
     seed: int = 1
     faults: tuple[FrameFault, ...] = ()  # faults of single frames
+    # modulus times thickness, for the gauge's reading
+    stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
 
     def __post_init__(self) -> None:
         if self.kind == "fringes" and not self.reference:
@@ -138,6 +141,11 @@ class SimulationSpec:
     def displacement_um(self, frame: int) -> float:
         """True position of the film during a frame (faults aside)."""
         return self.displacements_um[frame] if self.displacements_um else self.motion.at_um(self.time_s(frame))
+
+    def pressure_pa(self, displacement_um: float) -> float:
+        """Gauge pressure under a Hencky film there."""
+        load, _ = self.film.load_and_bowl(displacement_um)
+        return load * self.stiffness_n_per_m / (1e-3 * self.film.radius_mm)
 
     @property
     def reference_um(self) -> float:

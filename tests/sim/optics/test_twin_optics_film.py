@@ -10,6 +10,7 @@ import pytest
 from numpy.polynomial.polynomial import polyder, polyval
 from scipy.integrate import quad
 
+from membrane_ctrl.metrology.optics.film_law import FilmLaw
 from membrane_ctrl.sim import film as hencky
 from membrane_ctrl.sim.optics.film_shape import (
     Bump,
@@ -64,11 +65,35 @@ def test_the_bowl_holds_the_volume_that_the_gas_sees() -> None:
     assert volume == pytest.approx(hencky.solve().volume, rel=1e-9)
 
 
-@pytest.mark.parametrize("film", [RICH, FilmShape(37.1, bowl="paraboloid"), FilmShape(37.1)])
+@pytest.mark.parametrize(("prestrain", "poisson"), [(0.0, 0.3), (8e-4, 0.38), (-3e-4, 0.2), (2e-2, 0.3)])
+def test_a_stretched_film_is_the_laws(prestrain: float, poisson: float) -> None:
+    """Collocation against the scaled series of the metrology: neither knows of the other."""
+    load, profile = hencky.stretched(0.074, prestrain, poisson)
+    law = FilmLaw(prestrain, poisson, 1.0, 1.0).with_sag(0.074)
+    rho = np.linspace(0, 1, 21)
+    assert load == pytest.approx(float(law.load), rel=1e-11)
+    assert 0.074 * polyval(rho**2, profile) == pytest.approx(law.height_mm(rho), abs=1e-11)
+
+
+def test_a_stretched_film_keeps_its_ring_and_changes_its_profile() -> None:
+    film = FilmShape(37.1, prestrain=1e-3, poisson=0.36)
+    rim, half = (film.height_mm(np.array([r]), np.zeros(1), -4000.0)[0] for r in (500.0, 250.0))
+    assert rim == pytest.approx(33.1, abs=1e-9)
+    assert half / rim != pytest.approx(film.height_mm(np.array([250.0]), np.zeros(1))[0] / 37.1, abs=1e-4)
+    with pytest.raises(ValueError, match=r"poisson = 0.6 is outside 0 .. 0.5"):
+        FilmShape(37.1, poisson=0.6)
+    with pytest.raises(ValueError, match="slack at its ring"):
+        FilmShape(37.1, prestrain=-6e-3).height_mm(np.zeros(1), np.zeros(1))
+
+
+STRETCHED = FilmShape(37.1, prestrain=1e-3, poisson=0.36)
+
+
+@pytest.mark.parametrize("film", [RICH, FilmShape(37.1, bowl="paraboloid"), FilmShape(37.1), STRETCHED])
 def test_slopes_are_the_derivatives_of_the_height(film: FilmShape) -> None:
     step = 1e-3
     for x, y in ((0.0, 0.0), (120.0, -60.0), (-300.0, 350.0), (0.0, 499.0)):
-        _, hx, hy = height_and_slopes(film.terms, 37.0, x, y)
+        _, hx, hy = height_and_slopes(film.terms_at(-100.0), 37.0, x, y)
         grid = film.height_mm(np.array([x + step, x - step, x, x]), np.array([y, y, y + step, y - step]), -100.0)
         assert hx == pytest.approx((grid[0] - grid[1]) / (2 * step), abs=1e-9)
         assert hy == pytest.approx((grid[2] - grid[3]) / (2 * step), abs=1e-9)

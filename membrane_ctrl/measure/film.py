@@ -1,0 +1,249 @@
+"""The `film` command: the film's material from capture sets at several pressures."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.geometry import file, spread_file
+from membrane_ctrl.measure.measurement import Figures, SetFigure
+from membrane_ctrl.measure.results import write_figure, write_json
+from membrane_ctrl.metrology import film_fit
+from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model.arrays import FloatArray
+
+# The paper's film, to which an unknown one is compared
+_STIFFNESS_N_PER_M, _POISSON, _PRESSURE_PA, _PAPER_EDGE_MM = 2.05e5, 0.3, 600.0, 3.0
+_TOGETHER = 0.98  # correlation of two numbers that the sets give only together
+_UNLIKE_LAW = 0.5  # of the departure from Hencky left unexplained: another law
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """Options of the command."""
+
+    folders: tuple[Path, ...]
+    geometry: Path | None
+    gauge: film_fit.Gauge
+    out: Path | None
+    as_json: bool
+    pictures: bool
+
+
+@dataclass(frozen=True)
+class _Departure:
+    """Profiles (n, points) of the sets less those of the paper's film without pre-strain, mm; `left` by the law."""
+
+    radius_mm: FloatArray
+    seen_mm: FloatArray
+    left_mm: FloatArray
+
+    @property
+    def explained(self) -> float:
+        """Share of the departure that the law explains, RMS over the area."""
+        weight = self.radius_mm
+        return float(1 - np.sqrt(np.sum(weight * self.left_mm**2) / np.sum(weight * self.seen_mm**2)))
+
+
+def film_command(options: FilmOptions) -> int:
+    """Fit the law to the sets, write the result and report it. Raises CommandError."""
+    measured = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
+    sets = [measured.of(folder) for folder in terminal.counted(options.folders, "sets")]
+    mirror = sets[0].head.optics.mirror
+    for one in sets:
+        if one.head.optics.mirror.radius_mm != mirror.radius_mm:
+            raise errors.InputError(
+                f"{one.head.folder / 'capture.toml'}: mirror.radius_mm: not that of the first set"
+            )
+    figures, source = _figures(sets, options.geometry)
+    try:
+        fit = film_fit.fit_film(figures, mirror.radius_mm, mirror.analysis_radius_mm, options.gauge)
+    except ValueError as error:
+        raise errors.RejectedError(f"film: {error}") from None
+    departure = _departure(figures, fit, mirror.analysis_radius_mm)
+    notes = _notes(figures, fit, departure)
+    table = _table(figures, fit, departure, source, notes)
+    out = options.out.resolve() if options.out else options.folders[0].resolve().parent / "film"
+    with errors.writing(out):
+        files.make_folder(out)
+        write_json(out / "film.json", table)
+        if options.pictures:
+            _draw(out / "film.png", figures, fit, departure)
+    print(f"written to {out}", file=sys.stderr)
+    print(json.dumps(table) if options.as_json else "\n".join(_lines(table, figures)))
+    return 0
+
+
+def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fit.FilmFigure], str]:
+    """The sets' figures with their errors, and where the geometry's spread comes from."""
+    spread, source = spread_file.spread_of(sets[0].head.optics.geometry, geometry)
+    root = np.linalg.cholesky(spread.correlation() + 1e-9 * np.eye(len(spread.sigmas)))
+    out = []
+    for one in sets:
+        bench, surface = one.bench(), one.figure.fit.surface
+        noise, geometric = monte_carlo.noise_covariance(bench), monte_carlo.geometry_jacobian(bench, spread) @ root
+        name, pressure = one.head.folder.name, one.head.pressure_pa
+        out.append(film_fit.FilmFigure(name, surface.parameters, noise, geometric, pressure, surface.sag_mm))
+    return out, source
+
+
+def _departure(figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, reach_mm: float) -> _Departure:
+    radius = np.linspace(0.0, reach_mm, 96)
+    seen, left = [], []
+    for k, figure in enumerate(figures):
+        law = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, fit.law.radius_mm)
+        known = np.isfinite(figure.pressure_pa)
+        hencky = law.under(figure.pressure_pa) if known else law.with_sag(figure.sag_mm)
+        profiles = [
+            _profile_mm(parameters, fit.law.radius_mm, radius)
+            for parameters in (figure.parameters_mm, fit.left_mm[k])
+        ]
+        seen.append(profiles[0] - hencky.height_mm(radius / fit.law.radius_mm))
+        left.append(profiles[1])
+    return _Departure(radius, np.array(seen), np.array(left))
+
+
+def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) -> FloatArray:
+    """The rotationally symmetric part of a figure's height."""
+    angle = 2 * np.pi * np.arange(16)[:, None] / 16
+    surface = Surface.from_parameters(parameters_mm, radius_mm)
+    return np.asarray(surface.height(at_mm * np.cos(angle), at_mm * np.sin(angle)).mean(axis=0))
+
+
+def _notes(figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure) -> list[str]:
+    """What these sets cannot tell, in words."""
+    gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
+    notes = []
+    if not gauged:
+        notes.append("E t is not determined: no set states pressure_pa; pre-strain and nu need none")
+    strain, poisson, _ = fit.sigmas
+    if strain > film_fit.PRESTRAIN_SIGMA / 2:
+        notes.append("the pre-strain is not determined: its bar is what was known before")
+    if poisson > film_fit.POISSON_SIGMA / 2:
+        notes.append("nu is not determined: its bar is what was known before; take sets at other pressures")
+    together = fit.covariance[0, 1] / (strain * poisson)
+    if abs(together) > _TOGETHER:
+        sags = [figure.sag_mm for figure in figures]
+        notes.append(
+            f"pre-strain and nu are known only together (correlation {together:+.3f}): the sags, {min(sags):.1f} to "
+            f"{max(sags):.1f} mm, are too close"
+        )
+    if departure.explained < 1 - _UNLIKE_LAW and np.abs(departure.seen_mm).max() > 0.1:
+        notes.append(
+            "the film departs from this law: it crept between the sets, its ring moved, or it is not elastic"
+        )
+    return notes
+
+
+def _table(
+    figures: list[film_fit.FilmFigure],
+    fit: film_fit.FilmFit,
+    departure: _Departure,
+    source: str,
+    notes: list[str],
+) -> dict[str, Any]:
+    law, (strain, poisson, relative) = fit.law, fit.sigmas
+    gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
+    edge = [float(profile[-1]) for profile in departure.seen_mm]
+    return {
+        "schema": "membrane-film/1",
+        "sets": [
+            {
+                "set": figure.name,
+                "sag_mm": figure.sag_mm,
+                "pressure_pa": figure.pressure_pa if np.isfinite(figure.pressure_pa) else None,
+                "edge_from_hencky_mm": at_edge,
+                "left_rms_um": 1e3 * float(np.sqrt(np.sum(left**2))),
+            }
+            for figure, at_edge, left in zip(figures, edge, fit.left_mm, strict=True)
+        ],
+        "prestrain": {"value": law.prestrain, "sigma": float(strain)},
+        "poisson": {"value": law.poisson, "sigma": float(poisson)},
+        "stiffness_n_per_m": (
+            {"value": law.stiffness_n_per_m, "sigma": float(relative) * float(law.stiffness_n_per_m)}
+            if gauged
+            else None
+        ),
+        "covariance": fit.covariance.tolist(),  # of pre-strain, nu, relative stiffness
+        "ring": [
+            {
+                "cause": wave.cause,
+                "order": wave.order,
+                "cos_sin": wave.amounts.tolist(),
+                "sigmas": wave.sigmas.tolist(),
+            }
+            for wave in fit.waves
+            if wave.seen
+        ],
+        "misfit_um": fit.misfit_um,
+        "explained": departure.explained,
+        "paper_prestrain": _paper_prestrain(
+            float(law.poisson), law.stiffness_n_per_m if gauged else _STIFFNESS_N_PER_M
+        ),
+        "geometry": source,
+        "notes": notes,
+    }
+
+
+def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
+    """The pre-strain that makes this film 3 mm less deep than the paper's Hencky film at 600 Pa."""
+    strains = np.linspace(-2e-4, 5e-3, 200)
+    hencky = FilmLaw(0.0, _POISSON, _STIFFNESS_N_PER_M, 500.0).under(_PRESSURE_PA)
+    sags = FilmLaw(strains[:, None], poisson, stiffness, 500.0).under(_PRESSURE_PA).sag_mm.ravel()
+    return float(np.interp(_PAPER_EDGE_MM, float(hencky.sag_mm) - sags, strains))
+
+
+def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[str]:
+    strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
+    sags = [figure.sag_mm for figure in figures]
+    lines = [
+        f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; uncertainty of the geometry from "
+        f"{table['geometry']}",
+        f"pre-strain {1e6 * strain['value']:.1f} +- {1e6 * strain['sigma']:.2g} um/m",
+        f"nu         {poisson['value']:.4f} +- {poisson['sigma']:.2g}",
+    ]
+    if stiffness is not None:
+        lines.append(f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m")
+    for wave in table["ring"]:
+        unit, scale = ("um/m", 1e6) if wave["cause"] == "prestrain" else ("mm", 1.0)
+        what = {"prestrain": "pre-strain varies", "flat": "not flat", "round": "not round"}[wave["cause"]]
+        amount, sigma = scale * np.hypot(*wave["cos_sin"]), scale * max(wave["sigmas"])
+        lines.append(f"ring       {what}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} {unit}")
+    edges = [one["edge_from_hencky_mm"] for one in table["sets"]]
+    return [
+        *lines,
+        f"Hencky     the measured edge is {min(edges):+.3f} to {max(edges):+.3f} mm from Hencky's film of 205 kN/m, "
+        f"nu 0.3; the law explains {100 * table['explained']:.1f} %",
+        f"misfit     {table['misfit_um']:.3g} um a term that no law explains; it is in the bars",
+        f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} um/m in this film",
+        *(f"note       {note}" for note in table["notes"]),
+    ]
+
+
+def _draw(path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure) -> None:
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(13, 4.2), layout="constrained")
+    seen, left, both = drawing.subplots(1, 3)
+    for figure, profile, rest in zip(figures, departure.seen_mm, departure.left_mm, strict=True):
+        seen.plot(departure.radius_mm, profile, label=f"{figure.name}, {figure.sag_mm:.1f} mm")
+        left.plot(departure.radius_mm, 1e3 * rest)
+    seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")
+    left.set(title=f"less the law ({100 * departure.explained:.1f} % explained)", xlabel="radius (mm)", ylabel="um")
+    seen.legend(fontsize=8)
+    angle = np.linspace(0, 2 * np.pi, 181)
+    root = np.linalg.cholesky(fit.covariance[:2, :2])
+    centre = np.array([fit.law.prestrain, fit.law.poisson], float)
+    for sigmas in (1, 2):
+        strain, poisson = centre[:, None] + sigmas * root @ np.stack([np.cos(angle), np.sin(angle)])
+        both.plot(1e6 * strain, poisson, label=f"{sigmas} sigma")
+    both.plot(1e6 * centre[0], centre[1], "+", color="black")
+    both.set(title="pre-strain and Poisson ratio", xlabel="pre-strain (um/m)", ylabel="nu")
+    both.legend(fontsize=8)
+    write_figure(path, drawing)

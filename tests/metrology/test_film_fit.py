@@ -1,0 +1,158 @@
+"""The film's material from figures of the twin's films, whose solution and projection share no code with the fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from metrology_truth import FloatArray
+from numpy.polynomial import Legendre, Polynomial
+from prysm.polynomials import noll_to_nm, zernike_nm
+
+from membrane_ctrl.metrology import film_fit
+from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.sim.film import stretched
+
+RADIUS_MM, REACH = 500.0, 0.95
+ROUND = [2, 9, 20, 35]
+STIFFNESS = 2.05e5
+
+
+@dataclass(frozen=True)
+class World:
+    """Films to draw: what is planted besides the law, in mm."""
+
+    prestrain: float = 5e-4
+    poisson: float = 0.36
+    sags_mm: tuple[float, ...] = (33.0, 35.0, 37.0, 39.0)
+    figure_mm: float = 0.0  # the same in all sets, of every term
+    follows_mm: float = 0.0  # of a wrong law: grows with the square of the sag
+    scale: float = 0.0  # 1 sigma of an error of the geometry that makes every height larger
+    gauge: bool = True
+
+    def figures(self, seed: int) -> list[film_fit.FilmFigure]:
+        """One draw."""
+        rng = np.random.default_rng(seed)
+        common, wrong = self.figure_mm * rng.normal(size=36), self.follows_mm * rng.normal(size=4)
+        common[-1], wrong[-1] = common[-1] / 10, wrong[-1] / 10
+        gain, offset_pa, scale = rng.normal(size=3)
+        out = []
+        for k, sag_mm in enumerate(self.sags_mm):
+            load, profile = stretched(sag_mm / RADIUS_MM, self.prestrain, self.poisson)
+            true = np.zeros(36)
+            true[ROUND] = _round_terms(sag_mm * Polynomial(profile)) + wrong * (sag_mm / 36) ** 2
+            error = self.scale * true
+            seen = true + common + gain * error + rng.normal(0, 3e-6, 36)
+            pressure = load * STIFFNESS / 0.5 * (1 + 1e-3 * scale) + offset_pa + rng.normal(0, 0.3)
+            out.append(
+                film_fit.FilmFigure(
+                    f"set{k}", seen, 9e-12 * np.eye(36), error[:, None], pressure if self.gauge else np.nan, sag_mm
+                )
+            )
+        return out
+
+
+def _round_terms(height_mm: Polynomial) -> FloatArray:
+    """Noll 4, 11, 22 and the excess of a height over v, by slopes at many radii."""
+    rho = REACH * np.sqrt((np.arange(1500) + 0.5) / 1500)
+    slopes = [np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2) for k in (1, 2, 3)]
+    slopes.append(Polynomial(hencky.excess()).deriv()(rho**2) / hencky.excess_rms())
+    design = np.stack([2 * rho * slope for slope in slopes], axis=1)
+    return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
+
+
+def _fit(figures: list[film_fit.FilmFigure]) -> film_fit.FilmFit:
+    return film_fit.fit_film(figures, RADIUS_MM, 475.0, film_fit.Gauge())
+
+
+def _z(fit: film_fit.FilmFit, world: World) -> FloatArray:
+    law = fit.law
+    off = [law.prestrain - world.prestrain, law.poisson - world.poisson, np.log(law.stiffness_n_per_m / STIFFNESS)]
+    return np.array(off) / fit.sigmas
+
+
+def test_a_film_of_the_law_is_found_to_the_noise() -> None:
+    world = World(scale=6e-4)
+    fit = _fit(world.figures(1))
+    strain, poisson, stiffness = fit.sigmas
+    assert strain < 3e-6
+    assert poisson < 1e-3
+    assert stiffness < 3e-3
+    assert np.abs(_z(fit, world)).max() < 3.5
+    assert fit.misfit_um < 0.05
+    assert not any(wave.seen for wave in fit.waves)
+
+
+def test_without_a_gauge_the_stiffness_is_unknown_and_the_rest_is_not() -> None:
+    world = World(gauge=False)
+    fit = _fit(world.figures(2))
+    assert np.abs(_z(fit, world)[:2]).max() < 3.5
+    assert fit.sigmas[0] < 3e-6
+    assert fit.sigmas[2] > 10
+
+
+def test_what_no_law_explains_widens_the_bars() -> None:
+    """Micrometres of figure in all sets, ten times those of a clean film, and of another law."""
+    for seed, world in ((3, World(figure_mm=2e-3)), (4, World(figure_mm=1e-3, follows_mm=3e-3))):
+        fit = _fit(world.figures(seed))
+        assert fit.misfit_um > 0.3
+        assert fit.sigmas[0] > 2e-6
+        assert np.abs(_z(fit, world)).max() < 3.5
+
+
+def test_a_ring_that_is_not_flat_is_told_from_an_uneven_strain() -> None:
+    """Waves of the film's law, seen through Zernike terms of another library."""
+    world = World()
+    law = FilmLaw(world.prestrain, world.poisson, STIFFNESS, RADIUS_MM)
+    rho, angle = np.meshgrid(REACH * np.sqrt((np.arange(60) + 0.5) / 60), 2 * np.pi * np.arange(16) / 16)
+    terms, step = [6, 12, 24], 1e-5
+
+    def slopes(height) -> FloatArray:  # type: ignore[no-untyped-def]
+        by_r = (height(rho + step, angle) - height(rho - step, angle)) / (2 * step)
+        by_t = (height(rho, angle + step) - height(rho, angle - step)) / (2 * step) / rho
+        return np.concatenate([by_r.ravel(), by_t.ravel()])
+
+    design = np.stack([slopes(lambda r, t, j=j: zernike_nm(*noll_to_nm(j), r, t, norm=True)) for j in terms], axis=1)
+    figures = []
+    for figure in world.figures(5):
+        bowl = law.with_sag(figure.sag_mm)
+        flat, uneven = bowl.harmonic(2, "flat"), bowl.harmonic(2, "prestrain")
+        seen = slopes(lambda r, t, f=flat, u=uneven: r**2 * (0.3 * f(r**2) + 4e-5 * u(r**2)) * np.cos(2 * t))
+        parameters = figure.parameters_mm.copy()
+        parameters[[j - 2 for j in terms]] += np.linalg.lstsq(design, seen, rcond=None)[0]
+        figures.append(replace(figure, parameters_mm=parameters))
+    waves = {(wave.cause, wave.order): wave for wave in _fit(figures).waves}
+    for cause, true in (("flat", 0.3), ("prestrain", 4e-5)):
+        wave = waves[cause, 2]
+        assert wave.seen
+        assert wave.amounts == pytest.approx([true, 0.0], abs=0.05 * true)
+    assert abs(waves["round", 2].amounts[0]) < 0.05
+
+
+def test_one_set_is_too_few() -> None:
+    with pytest.raises(ValueError, match="two or more pressures"):
+        _fit(World().figures(1)[:1])
+
+
+@pytest.mark.campaign
+def test_bars_cover_the_truth_of_random_films() -> None:
+    """120 films of all kinds: z near 1 and never far off."""
+    rng = np.random.default_rng(11)
+    found = []
+    for seed in range(120):
+        span, middle = rng.uniform(0.05, 0.15), rng.uniform(30, 42)
+        world = World(
+            prestrain=10 ** rng.uniform(-5, -2.8),
+            poisson=rng.uniform(0.28, 0.42),
+            sags_mm=tuple(middle * (1 + np.linspace(-span, span, int(rng.integers(3, 7))))),
+            figure_mm=10 ** rng.uniform(-5, -2),
+            follows_mm=float(rng.choice([0.0, 1e-3])),
+            scale=rng.choice([0.0, 1e-4, 6e-4]),
+        )
+        found.append(_z(_fit(world.figures(seed)), world))
+    z = np.array(found)
+    print("z:", np.sqrt(np.mean(z**2, axis=0)), "within 1.96:", np.mean(np.abs(z) < 1.96, axis=0))
+    assert np.all(np.mean(np.abs(z) < 1.96, axis=0) > 0.85)
+    assert np.all(np.median(np.abs(z), axis=0) > 0.2)
