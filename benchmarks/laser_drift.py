@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.plant import Plant
 from tests.support.virtual_camera import VirtualCamera

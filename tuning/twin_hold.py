@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import shape_estimate, states, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News

@@ -15,7 +15,7 @@ from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.sim import bench_events, plant, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}

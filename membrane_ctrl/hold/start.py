@@ -217,7 +217,7 @@ async def _run(
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
 ) -> errors.Exit:
-    from membrane_ctrl.metrology.optics.hencky import zernike_projection
+    from membrane_ctrl.metrology.optics.film_law import zernike_projection
 
     assert config.devices is not None
     with contextlib.ExitStack() as stack:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.film_law import Bowl, FilmLaw, HarmonicCause
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.model.arrays import FloatArray, IntArray
@@ -129,7 +129,7 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
     slopes = [np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(np.eye(4)[k])) for k in (1, 2, 3)]
-    excess = 2 * rho * series.polyval(rho**2, series.polyder(hencky.excess())) / hencky.excess_rms()
+    excess = 2 * rho * series.polyval(rho**2, series.polyder(film_law.excess())) / film_law.excess_rms()
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
 
 

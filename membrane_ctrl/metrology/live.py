@@ -13,7 +13,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
-from membrane_ctrl.metrology.optics import geometry, hencky, surface, zernike
+from membrane_ctrl.metrology.optics import film_law, geometry, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
@@ -159,7 +159,7 @@ class LiveReconstructor:
 
     def sag_sensitivity(self) -> FloatArray:
         """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
-        return hencky.zernike_projection().copy()
+        return film_law.zernike_projection().copy()
 
     def _tracer(self, readings_um: FloatArray) -> reconstruct.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""

@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from membrane_ctrl.metrology.optics import compiled, hencky, kernels, zernike
+from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
@@ -114,7 +114,7 @@ HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm ->
 TOLERANCE_MM = 1e-6  # the paper's threshold on the largest change of height
 CONTRACTION = 1 / 100  # of one step; observed: 1/300, the rest is margin
 MAX_ITERATIONS = 20
-_EXCESS = hencky.excess() / hencky.excess_rms()
+_EXCESS = film_law.excess() / film_law.excess_rms()
 
 
 @dataclass
@@ -237,7 +237,7 @@ class Tracer:
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
 
     def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
-        return surface.polynomial, _EXCESS, surface.hencky_mm * hencky.excess_rms(), self.radius_mm
+        return surface.polynomial, _EXCESS, surface.hencky_mm * film_law.excess_rms(), self.radius_mm
 
 
 def parabola(sag_mm: float, radius_mm: float) -> HeightFunction:

@@ -23,7 +23,7 @@ from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.memory import UnknownMemoryError
 from membrane_ctrl.controller.tick import Records, TickBatch
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.replay import replay as replays

@@ -11,7 +11,7 @@ from membrane_ctrl.acquisition.worker import LiveDrift, geometry_event
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
 from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 

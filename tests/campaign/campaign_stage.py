@@ -15,7 +15,7 @@ from firmware_iface.emulators.board_state import BoardSample
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.virtual_bench import VirtualBench, _MemoryLink
 

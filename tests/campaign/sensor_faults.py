@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConf
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import Rung, State

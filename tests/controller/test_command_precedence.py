@@ -17,7 +17,7 @@ from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, in_ord
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.states import Rung, State
 

@@ -16,7 +16,7 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import UnknownMemoryError, recall, remember
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.states import State
 from membrane_ctrl.replay.replay import RecordedTick, replay

@@ -13,7 +13,7 @@ from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench

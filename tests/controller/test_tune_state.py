@@ -17,7 +17,7 @@ from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.states import State
 from membrane_ctrl.sim.bench_events import AmbientChange

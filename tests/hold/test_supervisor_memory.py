@@ -13,7 +13,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import recall
 from membrane_ctrl.controller.tick import MESSAGE_BYTES, TickAssembler
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.run_events import from_dict

@@ -11,7 +11,7 @@ from numpy.polynomial import Legendre, Polynomial
 from prysm.polynomials import noll_to_nm, zernike_nm
 
 from membrane_ctrl.metrology import film_fit
-from membrane_ctrl.metrology.optics import hencky
+from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.film_law import FilmLaw
 from membrane_ctrl.sim.film import stretched
 
@@ -58,7 +58,7 @@ def _round_terms(height_mm: Polynomial) -> FloatArray:
     """Noll 4, 11, 22 and the excess of a height over v, by slopes at many radii."""
     rho = REACH * np.sqrt((np.arange(1500) + 0.5) / 1500)
     slopes = [np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2) for k in (1, 2, 3)]
-    slopes.append(Polynomial(hencky.excess()).deriv()(rho**2) / hencky.excess_rms())
+    slopes.append(Polynomial(film_law.excess()).deriv()(rho**2) / film_law.excess_rms())
     design = np.stack([2 * rho * slope for slope in slopes], axis=1)
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
 

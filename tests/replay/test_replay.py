@@ -28,7 +28,7 @@ from membrane_ctrl.controller.tick import (
     pack_tick,
     unpack_tick,
 )
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault

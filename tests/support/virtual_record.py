@@ -17,7 +17,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import remember
 from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_tick
 from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.optics.hencky import zernike_projection
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files.tables import ColumnTables

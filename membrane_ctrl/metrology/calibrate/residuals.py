@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
-from membrane_ctrl.metrology.optics import compiled, hencky, kernels, screen_face, zernike
+from membrane_ctrl.metrology.optics import compiled, film_law, kernels, screen_face, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
@@ -246,7 +246,7 @@ def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArr
 def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Heights and slopes (36, n) of the surface's parameters in radii, each 0 at the vertex."""
     v = x * x + y * y
-    excess = hencky.excess() / hencky.excess_rms()
+    excess = film_law.excess() / film_law.excess_rms()
     bowl = series.polyval(v, excess) - excess[0]
     grows = 2 * series.polyval(v, series.polyder(excess))
     powers, tables = _monomials(x, y), _tables()

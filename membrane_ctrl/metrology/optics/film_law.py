@@ -22,15 +22,16 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.polynomial import Legendre, legendre
+from numpy.polynomial import Chebyshev, Legendre, Polynomial, legendre
 from numpy.polynomial import polynomial as series
 
+from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 SLACKEST = 21.0  # the series' last term is then below 1e-12; a slacker film wrinkles at its ring
 _USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 600 Pa
 _SERIES_TERMS = 80
-_TERMS = 14  # of a disturbance: it converges tenfold a term
+_WAVE_TERMS = 14  # of a disturbance: it converges tenfold a term
 _NODES = 48
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
@@ -174,7 +175,7 @@ class Bowl:
         return Legendre(a * self._ritz(order, *ring), domain=[0, 1])
 
     def _ritz(self, order: int, outward: float, upward: float) -> FloatArray:
-        """Coefficients (_TERMS,) of the height / a with the least energy, given the ring's displacements / a."""
+        """Coefficients (_WAVE_TERMS,) of the height / a with the least energy, given the ring's displacements / a."""
         nodes, weights = legendre.leggauss(_NODES)
         rho = (nodes + 1) / 2
         rise, stresses = self.rise_mm(rho) / self.radius_mm, self.stresses(rho)
@@ -192,19 +193,72 @@ class Bowl:
         energy = ((radial * area) @ (radial + nu * hoop).T + (hoop * area) @ (hoop + nu * radial).T) / (1 - nu**2)
         energy += (shear * area) @ shear.T / (2 * (1 + nu))
         energy += (w_r * area * stresses[0]) @ w_r.T + order**2 * (w * area * stresses[1] / rho**2) @ w.T
-        ones, none = np.ones(_TERMS), np.zeros(_TERMS)
+        ones, none = np.ones(_WAVE_TERMS), np.zeros(_WAVE_TERMS)
         ring = np.stack(
             [np.concatenate([none, ones, ones]), np.concatenate([none, -ones, ones]), np.append(ones, [none, none])]
         )
         system = np.block([[energy, ring.T], [ring, np.zeros((3, 3))]])
         right = np.append(np.zeros(len(energy)), [outward, 0.0, upward])
-        return np.asarray(np.linalg.solve(system, right)[:_TERMS])
+        return np.asarray(np.linalg.solve(system, right)[:_WAVE_TERMS])
 
 
 def _powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
-    """rho^power P_k(2 rho^2 - 1) and its derivative, (_TERMS, n)."""
+    """rho^power P_k(2 rho^2 - 1) and its derivative, (_WAVE_TERMS, n)."""
     x = 2 * rho**2 - 1
-    table = np.eye(_TERMS)
+    table = np.eye(_WAVE_TERMS)
     value = legendre.legval(x, table)
     slope = legendre.legval(x, legendre.legder(table))
     return value * rho**power, power * rho ** (power - 1) * value + 4 * rho ** (power + 1) * slope
+
+
+# Hencky's bowl: the law without pre-strain, as a polynomial in v.
+#
+# Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with Legendre's P_k, so the
+# Legendre series of the profile *is* its Zernike expansion. P_0..P_3 are Noll 1, 4, 11 and 22 and among the 36 terms;
+# the rest is the "excess", some micrometres of a 37 mm bowl.
+
+POISSON_RATIO = 0.3
+# Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of the sag
+EXCESS_TERMS = 15
+_CARRIED = {0: 1, 1: 4, 2: 11, 3: 22}  # Legendre degree -> Noll index
+
+
+@cache
+def profile_legendre() -> Legendre:
+    """Depth H(v) of a bowl of unit sag, 0 at the vertex and 1 at the rim, as Legendre series on v in [0, 1]."""
+    bowl = FilmLaw(0.0, POISSON_RATIO, 1.0, 1.0).with_sag(1.0)
+    depth = Chebyshev.interpolate(lambda v: bowl.height_mm(np.sqrt(v)), EXCESS_TERMS + 8, domain=[0, 1])
+    return depth.convert(domain=[0, 1], kind=Legendre).truncate(EXCESS_TERMS)
+
+
+@cache
+def zernike_projection() -> FloatArray:
+    """Noll coefficients (36,) of a Hencky bowl of unit sag; also their change per unit of sag."""
+    out = np.zeros(TERMS)
+    for degree, j in _CARRIED.items():
+        out[j - 1] = profile_legendre().coef[degree] / np.sqrt(2 * degree + 1)
+    out.setflags(write=False)
+    return out
+
+
+@cache
+def excess() -> FloatArray:
+    """Power series in v of the part of a bowl of unit sag that the 36 terms cannot represent."""
+    coef = profile_legendre().coef.copy()
+    coef[list(_CARRIED)] = 0.0
+    out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef
+    out.setflags(write=False)
+    return np.asarray(out)
+
+
+@cache
+def excess_rms() -> float:
+    """RMS over the disc of the excess of a bowl of unit sag."""
+    coef: FloatArray = np.asarray(profile_legendre().coef).astype(np.float64)
+    squares = coef**2 / (2 * np.arange(EXCESS_TERMS) + 1)
+    return float(np.sqrt(np.sum(np.delete(squares, list(_CARRIED)))))
+
+
+def profile(rho: FloatArray) -> FloatArray:
+    """Depth of a bowl of unit sag at rho = r / R, 0 at the vertex and 1 at the rim."""
+    return np.asarray(profile_legendre()(np.square(rho)))

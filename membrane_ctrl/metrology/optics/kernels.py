@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.optics import hencky, screen_face
+from membrane_ctrl.metrology.optics import film_law, screen_face
 from membrane_ctrl.metrology.optics.compiled import kernel, step
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 
@@ -46,7 +46,7 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     v = x * x + y * y
     e = 0.0
     ev = 0.0
-    for k in range(hencky.EXCESS_TERMS - 1, -1, -1):
+    for k in range(film_law.EXCESS_TERMS - 1, -1, -1):
         ev = ev * v + e
         e = e * v + excess[k]
     return h + amplitude * e, hx + 2 * amplitude * ev * x, hy + 2 * amplitude * ev * y, ev

@@ -10,7 +10,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from membrane_ctrl.metrology.optics import hencky, zernike
+from membrane_ctrl.metrology.optics import film_law, zernike
 from membrane_ctrl.model.arrays import FloatArray
 
 PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
@@ -27,18 +27,18 @@ class Surface:
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
         """The surface of a parameter vector [a_2..a_36, excess with unit RMS] in mm; piston set for h(0, 0) = 0."""
-        hencky_mm = float(parameters[-1]) / hencky.excess_rms()
+        hencky_mm = float(parameters[-1]) / film_law.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
     @classmethod
     def hencky_bowl(cls, sag_mm: float, radius_mm: float) -> "Surface":
         """A Hencky bowl of the given sag."""
-        return cls(sag_mm * hencky.zernike_projection(), sag_mm, radius_mm)
+        return cls(sag_mm * film_law.zernike_projection(), sag_mm, radius_mm)
 
     @property
     def parameters(self) -> FloatArray:
         """[a_2..a_36, excess with unit RMS] in mm."""
-        return np.append(self.coeffs_mm[1:], self.hencky_mm * hencky.excess_rms())
+        return np.append(self.coeffs_mm[1:], self.hencky_mm * film_law.excess_rms())
 
     @cached_property
     def polynomial(self) -> FloatArray:
@@ -48,7 +48,7 @@ class Surface:
     @cached_property
     def excess(self) -> FloatArray:
         """The excess as a power series in (r / R)^2, in mm."""
-        return self.hencky_mm * hencky.excess()
+        return self.hencky_mm * film_law.excess()
 
     @property
     def sag_mm(self) -> float:
@@ -82,15 +82,15 @@ def parameter_to_coeffs() -> FloatArray:
     out = np.zeros((zernike.TERMS, PARAMETERS))
     out[1:, :-1] = np.eye(zernike.TERMS - 1)
     out[0, :-1] = -zernike.at_vertex()[1:]
-    out[0, -1] = -hencky.excess()[0] / hencky.excess_rms()
+    out[0, -1] = -film_law.excess()[0] / film_law.excess_rms()
     return out
 
 
 @cache
 def sag_gradient() -> FloatArray:
     """d sag / d parameters (36,): mean over the rim minus the vertex, term by term."""
-    excess = hencky.excess()
-    rim_minus_vertex = (excess.sum() - excess[0]) / hencky.excess_rms()
+    excess = film_law.excess()
+    rim_minus_vertex = (excess.sum() - excess[0]) / film_law.excess_rms()
     return np.append((zernike.at_rim() - zernike.at_vertex())[1:], rim_minus_vertex)
 
 
@@ -103,7 +103,7 @@ def height_probe() -> FloatArray:
     k = np.arange(512)
     rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = np.polynomial.polynomial.polyval(rho**2, hencky.excess()) / hencky.excess_rms()
+    excess = np.polynomial.polynomial.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
     terms = np.vstack([zernike.values(x, y), excess])
     return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
 
@@ -136,7 +136,7 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
     x, y = np.meshgrid(axis_mm, axis_mm)
     seen = np.isfinite(height_mm)
     r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
-    shape = hencky.profile(r / rim_mm)
+    shape = film_law.profile(r / rim_mm)
     shape_mean, h_mean = shape.mean(), h.mean()
     # least squares with a free offset: a dimple at the vertex must not shift the whole comparison
     sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
@@ -150,7 +150,7 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
             # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
             rows.append((r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5])))
     radius, mean, low, high = np.array(rows).T
-    bowl = sag * hencky.profile(radius / rim_mm) + h_mean - sag * shape_mean
+    bowl = sag * film_law.profile(radius / rim_mm) + h_mean - sag * shape_mean
     return RadialProfile(radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, reconstruct
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.optics import hencky, zernike
+from membrane_ctrl.metrology.optics import film_law, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
@@ -180,7 +180,7 @@ def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> Float
     """Matrix (points, 36) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
-    out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, hencky.excess()) / hencky.excess_rms()
+    out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, film_law.excess()) / film_law.excess_rms()
     return out
 
 
