@@ -28,9 +28,11 @@ _RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "rou
 _ROUND = np.array([2, 9, 20, 35])  # of a figure's 36 parameters: Noll 4, 11, 22, excess
 _FREEDOM = np.array([1.0, 1.0, 1.0, 0.1])  # of a misfit: the excess has a tenth of a term's
 _DIFFERS = 0.1  # of the misfit that differs between the sets, the part that does not follow the sag
-_SIZES_MM = np.logspace(-6, -0.5, 12)  # of both misfits
+_LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
+_TIMES_SEEN = np.logspace(-1, 2.5, 15)  # sizes of the common misfit, in those of the terms without a law
+_SIZES_MM = np.logspace(-6, -0.5, 10)  # of the other misfit
 # by which the law's misfit is unlike that of the terms without a law: natural logarithm, of a Cauchy distribution
-_UNLIKE = 0.7
+_UNLIKE = 1.0
 _SURE = 4.0  # sigmas
 _NODES = 40
 _ITERATIONS = 40
@@ -114,7 +116,7 @@ def _seen_mm(figures: Sequence[FilmFigure]) -> float:
     """Size of a term that no law of this module has, from those with azimuthal orders of 4 and more."""
     others = np.concatenate([_terms(order).ravel() for order in (4, 5, 6, 7)])
     squares = [each.parameters_mm[others] ** 2 - np.diag(each.noise_mm2)[others] for each in figures]
-    return float(np.sqrt(max(np.mean(squares), _SIZES_MM[0] ** 2)))
+    return float(np.sqrt(max(np.mean(squares), _LEAST_MM**2)))
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
@@ -255,7 +257,7 @@ def _averaged(
 ) -> _Solved:
     """The unknowns averaged over the sizes of both misfits; `seen_mm` is the size of misfits elsewhere."""
     found, logs, sizes = [], [], []
-    for common in _SIZES_MM:
+    for common in seen_mm * _TIMES_SEEN:
         for differs in _SIZES_MM:
             one = _solved(
                 design, residual, noise + common**2 * misfits[0] + differs**2 * misfits[1], known, precision
