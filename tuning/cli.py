@@ -164,7 +164,7 @@ def compare(
 ) -> int:
     """Compare two sessions: the gains of each on the plant and weather of each."""
     from membrane_ctrl.sessions.folder import open_session
-    from tuning.comparison import compared
+    from tuning.choice import compared
 
     print(compared(open_session(a), open_session(b)))
     return 0

@@ -23,7 +23,7 @@ from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, open_sess
 from tuning import command as tune
 from tuning import gains_file as journal
 from tuning import session
-from tuning.comparison import compared as compare
+from tuning.choice import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
 from tuning.proposal.design import NAMES
