@@ -300,7 +300,10 @@ def verify_step(
     except live_hold.HoldError as error:
         reason = str(error)
     if reason:
-        rig.set_gains(before, f"verification failed: {reason}"[:250])
+        try:
+            rig.set_gains(before, f"verification failed: {reason}"[:250])
+        except live_hold.HoldError:  # the hold has gone, and takes them back by itself
+            raise live_hold.HoldError(reason) from None
     else:
         rig.keep()
     done = Verified(not reason, reason, tuple(looks), before, after)

@@ -22,6 +22,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder
+from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import review_runs
 from tests.support.browser import CHROMIUM, browser_tab
 from tuning import gains_file, session
@@ -137,6 +138,27 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(template:
     assert SHORT.typical_s == pytest.approx(300.0, abs=1.0)
     opened.begin("characterise")
     assert not opened.file("held.npz").exists()
+
+
+def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_path: Path) -> None:
+    """Not that it then takes no gains; the verification is still to be done."""
+    opened = copy_of(template, tmp_path)
+    folder.write(opened.file("applied.json"), {})
+
+    class Lost:
+        dt_s, told = 0.02, 0
+
+        def set_gains(self, *given: object) -> None:
+            self.told += 1
+            if self.told > 1:
+                raise HoldError("refused: gains is not allowed in state lower")
+
+        def hold(self, duration_s: float) -> None:
+            raise HoldError("the mirror is not held (state lower)")
+
+    with pytest.raises(HoldError, match="the mirror is not held"):
+        session.verify_step(opened, Lost())  # type: ignore[arg-type]
+    assert not opened.done("verify")
 
 
 def test_a_run_gives_its_weather_and_says_whose_plant_it_is(template: Path, tmp_path: Path) -> None:
