@@ -1,10 +1,14 @@
 """What a person decides: which candidate is applied, and whether kept gains become those of the configuration."""
 
 import difflib
+import json
 import sys
 import tomllib
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
+from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.cross_check import require_sound
 from membrane_ctrl.model import errors, files, terminal
@@ -86,7 +90,9 @@ _ANY = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> int:
-    """Save a session's kept gains, by default those kept last, into a configuration file; returns the exit code.
+    """Save a session's kept gains and curve of the pump, by default those kept last, into a configuration file.
+
+    Returns the exit code.
 
     Shows the difference and asks; without a terminal only `yes` writes. Comments stay.
 
@@ -97,13 +103,15 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     folder = open_session(name)
     gains = _kept(folder)
     config = toml_file.load(path, schema.Config)
-    _require_same_bench(path, config, folder)
+    pump = folder.config.pump
+    replaces = session.mapped(folder) and config.pump == session.mapped_of(folder).before
+    _require_same_bench(path, config.model_copy(update={"pump": pump}) if replaces else config, folder)
     before = files.read_text(path, follow=True)
-    changed = {key: getattr(gains, key) for key in GAIN_KEYS if getattr(gains, key) != getattr(config.loop, key)}
+    changed = {"loop": _changes(config.loop, gains, GAIN_KEYS), "pump": _changes(config.pump, pump)}
     after = _with(before, changed, path)
-    loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed)
-    require_sound(config.model_copy(update={"loop": loop}), str(path))
-    if not changed:
+    loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed["loop"])
+    require_sound(config.model_copy(update={"loop": loop, "pump": pump}), str(path))
+    if not any(changed.values()):
         print(f"{path} already has the gains of {folder.path.name}")
         return errors.Exit.DONE
     shown = difflib.unified_diff(
@@ -119,8 +127,19 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     return errors.Exit.DONE
 
 
+def _changes(old: Section, new: Section, keys: Collection[str] = ()) -> dict[str, Any]:
+    """Settings of a table that differ, all or some, as plain values."""
+    plain = new.model_dump(mode="json", include=set(keys) or None)
+    return {key: value for key, value in plain.items() if getattr(new, key) != getattr(old, key)}
+
+
 def _kept(folder: SessionFolder) -> schema.LoopConfig:
-    """The gains that the session verified and kept. Raises InputError if there are none, or they were rolled back."""
+    """The gains that the session kept: verified, or with a curve of the pump.
+
+    Raises InputError if there are none, or they were rolled back.
+    """
+    if session.mapped(folder) and not (folder.done("verify") and session.verified_of(folder).kept):
+        return folder.head.before
     done = session.verified_of(folder)
     if not done.kept:
         raise InputError(f"{folder.path}: its gains were not kept: {done.reason}")
@@ -147,23 +166,28 @@ def _require_same_bench(path: Path | str, config: schema.Config, folder: Session
                 )
 
 
-def _with(text: str, changed: dict[str, float], path: Path) -> str:
-    """The configuration's text with these keys of `[loop]`; nothing else changes, or InputError is raised."""
+def _with(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
+    """The configuration's text with these keys of its tables; nothing else changes, or InputError is raised."""
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
     wanted = tomllib.loads(text)
-    wanted["loop"] = wanted.get("loop", {}) | changed
+    changed = {name: keys for name, keys in changed.items() if keys}
+    wanted |= {name: wanted.get(name, {}) | keys for name, keys in changed.items()}
     try:
         document = tomlkit.parse(text)
-        document.setdefault("loop", tomlkit.table()).update(changed)
+        for name, keys in changed.items():
+            document.setdefault(name, tomlkit.table()).update(keys)
         edited = tomlkit.dumps(document)
         if tomllib.loads(edited) == wanted:
             return edited
     except (TOMLKitError, ValueError):
         pass
-    lines = ", ".join(f"{key} = {value:g}" for key, value in changed.items())
-    raise InputError(f"{path}: cannot be edited by a program; set in [loop]: {lines}")
+    lines = "; ".join(
+        f"set in [{name}]: " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in keys.items())
+        for name, keys in changed.items()
+    )
+    raise InputError(f"{path}: cannot be edited by a program; {lines}")
 
 
 def _replace(path: Path, before: str, after: str) -> None:

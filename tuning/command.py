@@ -77,7 +77,14 @@ def run_session(options: TuneOptions) -> int:
     with _session(options) as (folder, rig, progress):
         if options.page:
             progress.say(f"live page: {_served(folder, options)}session")
-        _do_all([step for step in STEPS if not folder.done(step)], folder, rig, options, progress)
+        try:
+            _do_all([step for step in STEPS if not folder.done(step)], folder, rig, options, progress)
+        except session.PumpUnknownError as error:
+            if session.mapped(folder):
+                raise
+            progress.say(str(error))
+            folder = _map_pump(folder, rig, options.limit_um, progress)
+            _do_all(list(STEPS), folder, rig, options, progress)
         _note_verified(folder, options.logs, options.reason)  # if the session was killed before it did
         report.write_report(folder)
     return _concluded(folder, options)
@@ -121,23 +128,32 @@ def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneO
 
 
 def map_pump(options: TuneOptions) -> int:
-    """Measure the pump for the later steps of the session."""
+    """Measure the pump's curve and apply it; the session begins anew on it."""
     with _session(options) as (folder, rig, progress):
-        progress.begin("pump map", PUMP_TYPICAL_S, 0.0)
-        found = session.map_pump(folder, rig)
-        pump = found.pump
-        progress.say(
-            f"{len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
-            f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} um/s at {pump.curve_fraction[-1]:.3f}, "
-            f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; "
-            f"starts at {pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
-            f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after {found.delay_s:.2f} s "
-            f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s; [pump] for the configuration: "
-            f"{folder.file('pump.toml')}"
-        )
-        if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
-            progress.say(_TOO_TIGHT)
+        folder = _map_pump(folder, rig, options.limit_um, progress)
     return _concluded(folder, options)
+
+
+def _map_pump(folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress) -> SessionFolder:
+    progress.begin("pump", PUMP_TYPICAL_S, 0.0)
+    mapped, folder = session.map_pump(folder, rig, limit_um)
+    found, pump = mapped.found, mapped.found.pump
+    progress.say(
+        f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
+        f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} um/s at {pump.curve_fraction[-1]:.3f}, "
+        f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; "
+        f"starts at {pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
+        f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after {found.delay_s:.2f} s "
+        f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s"
+    )
+    progress.say(
+        f"pump: a relay on this curve gives k {mapped.gain:.2f} +- {mapped.gain_sigma:.2f}; curve and gains "
+        f"({_gains_words(rig.loop)}) stay until the hold ends; `membrane-ctrl tune save {folder.path} --config FILE` "
+        "saves them for the next one"
+    )
+    if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
+        progress.say(_TOO_TIGHT)
+    return folder
 
 
 def outer(options: TuneOptions) -> int:
@@ -270,6 +286,8 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
         session.preview_step(folder)
     report.write_report(folder)
     progress.say(f"{step}: {_in_a_line(step, folder)}")
+    if step == "identify" and rig is not None and session.found_of(folder).quality.pump_unknown:
+        raise session.PumpUnknownError("identify: the pump is not what it is taken for")
 
 
 def _verify(folder: SessionFolder, rig: HoldRig, options: TuneOptions, told: Callable[[Stage], None]) -> None:
@@ -351,6 +369,7 @@ def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[Sessio
     with _link(options) as link:
         folder = _folder(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
+        rig.good = folder.head.before, folder.config.pump
         progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.say)
         rig.seen = progress.log.tick
         with progress.catching():
@@ -360,7 +379,7 @@ def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[Sessio
                     yield folder, rig, progress
                 progress.note("ended", "done")
             except BaseException as error:
-                _go_back(rig, folder.head.before, progress)
+                _go_back(rig, progress)
                 progress.note("ended", str(error) or "interrupted")
                 progress.say(f"resume it with `membrane-ctrl tune run --resume {folder.path}`")
                 if isinstance(error, HoldError):
@@ -368,10 +387,10 @@ def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[Sessio
                 raise
 
 
-def _go_back(rig: HoldRig, before: LoopConfig, progress: Progress) -> None:
+def _go_back(rig: HoldRig, progress: Progress) -> None:
     progress.interrupted = False
     try:
-        rig.go_back(before)
+        rig.go_back()
     except HoldError as error:
         progress.say(f"could not restore the last good gains ({error}); gains on trial revert automatically")
         return

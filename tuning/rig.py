@@ -127,7 +127,8 @@ class HoldRig:
         self.seen: Callable[[telemetry.TelemetryRow], None] = lambda row: None  # each recorded tick
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
-        self.loop = link.config.loop  # with the gains last set
+        self.loop, self.pump = link.config.loop, link.config.pump  # as last set
+        self.good = self.loop, self.pump  # to go back to
         self.dt_s = 1 / self.loop.rate_hz
         self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
@@ -149,7 +150,7 @@ class HoldRig:
 
     def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
         """Operating point of an experiment, from the hold before it."""
-        return around_of(held, self.loop, self._link.config.pump, limit_um)
+        return around_of(held, self.loop, self.pump, limit_um)
 
     def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
         """Let the controller run an experiment; the record ends with the tick that returns to hold.
@@ -174,14 +175,20 @@ class HoldRig:
         return rows, machine.Finished(told.completed, told.reason)
 
     def set_gains(
-        self, loop: LoopConfig, why: str = "tuning session", trial_s: float = math.nan, shape_s: float = math.nan
+        self,
+        loop: LoopConfig,
+        why: str = "tuning session",
+        trial_s: float = math.nan,
+        shape_s: float = math.nan,
+        pump: PumpConfig | None = None,
     ) -> None:
         """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
 
-        `shape_s`: time constant of the shape loop; NaN leaves it.
+        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave them.
         """
-        self._link.ask(Command("gains", self._who, why, value=trial_s, loop=loop, shape_time_constant_s=shape_s))
-        self.loop = loop
+        told = Command("gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump)
+        self._link.ask(told)
+        self.loop, self.pump = loop, pump or self.pump
 
     def keep(self) -> None:
         """Keep the gains that are on trial."""
@@ -195,11 +202,11 @@ class HoldRig:
         """Switch the shape loop."""
         self._link.ask(Command("shape_on" if on else "shape_off", self._who, why))
 
-    def go_back(self, loop: LoopConfig) -> None:
-        """End any running experiment and set the last good gains."""
+    def go_back(self) -> None:
+        """End any running experiment and set the last good gains and curve."""
         self.end_experiment()
-        if loop != self.loop:
-            self.set_gains(loop, "back to the last good gains")
+        if self.good != (self.loop, self.pump):
+            self.set_gains(self.good[0], "back to the last good gains", pump=self.good[1])
 
     def end_experiment(self) -> None:
         """End the experiment that runs, perhaps that of a session that was killed, and discard its ticks."""

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config import schema
-from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model import errors, files, states, telemetry
 from membrane_ctrl.sessions import folder, live_hold
-from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
+from tuning.gains_file import MS_MAX, GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
 from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey, records
 from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import candidates, design, prediction, trade, verify
@@ -27,7 +26,7 @@ _PREVIEW_SEEDS = 3
 # Time to check the applied gains and start the verification; then they revert automatically.
 _APPLY_S = 900.0
 _SPARE_S = 120.0
-_MAP_S = 1800.0
+_MAP_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +77,10 @@ class Verified:
     after: schema.LoopConfig
 
 
+class PumpUnknownError(errors.RejectedError):
+    """The experiments fail, or contradict themselves, in a way that the pump's curve may explain."""
+
+
 def characterise_step(
     session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0, plan: characterise.Plan = characterise.FULL
 ) -> characterise.Experiments:
@@ -86,7 +89,7 @@ def characterise_step(
     try:
         done = characterise.experiment(rig, limit_um, plan)
     except (characterise.ExperimentError, ValueError) as error:
-        raise errors.RejectedError(f"characterise: {error}") from None
+        raise PumpUnknownError(f"characterise: {error}") from None
     records.save_record(session.file("experiments.npz"), done.record)
     if plan is characterise.SHORT and done.held is not None:
         records.save_record(session.file(_HELD), done.held)
@@ -151,7 +154,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
     session.begin("design")
     before = session.head.before
     try:
-        made = design.propose(found.identified, disturbance, before, pump_of(session), found.quality)
+        made = design.propose(found.identified, disturbance, before, session.config.pump, found.quality)
     except design.RefusedError as error:
         raise errors.RejectedError(f"design: {error}") from None
     assert made.chosen.predicted is not None  # a proposal keeps its margins
@@ -228,7 +231,7 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
     found, disturbance = found_of(session), disturbance_of(session)
     gains = load_gains(session.file("gains.toml"))
     session.begin("preview")
-    pump, model = pump_of(session), found.identified.model
+    pump, model = session.config.pump, found.identified.model
     present, proposed = (
         tuple(design.preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
         for loop in (session.head.before, gains.loop)
@@ -241,12 +244,6 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
 def preview_of(session: folder.SessionFolder) -> Previewed:
     """Result of the preview."""
     return session.result("preview", "preview.json", Previewed)
-
-
-def pump_of(session: folder.SessionFolder) -> schema.PumpConfig:
-    """The pump as mapped in this session, else as configured."""
-    path = session.file("pump.toml")
-    return config_file.load(path, schema.PumpConfig) if path.exists() else session.config.pump
 
 
 def checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
@@ -321,28 +318,93 @@ def verified_of(session: folder.SessionFolder) -> Verified:
 # Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0}
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
+_IN_VAIN = 5  # experiments in a row that are over at once
+_CURVE_OFF = 0.2  # of k; the margins tolerate more
 
 
-def map_pump(session: folder.SessionFolder, rig: HoldRig) -> pump_survey.PumpMap:
-    """Measure the pump for the later steps. Raises RejectedError, with what to check, if it cannot hold a mirror."""
-    before = rig.loop
-    rig.set_gains(before.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
-    around = rig.around(_returned(rig))
-    holding = gas.PumpCurve(session.config.pump).fraction(around.holding_flow_um_per_s)
-    survey = pump_survey.PumpSurvey(holding, around.limit_um)
+@dataclass(frozen=True, slots=True)
+class MappedPump:
+    """`pump_map.json`: what was measured and applied, and what the pump was taken for before."""
+
+    found: pump_survey.PumpMap
+    before: schema.PumpConfig
+    gain: float  # of the mirror on the curve, from a relay: 1
+    gain_sigma: float
+
+
+def mapped(session: folder.SessionFolder) -> bool:
+    """Whether the session is based on a curve that it has measured."""
+    return session.file("pump_map.json").exists()
+
+
+def mapped_of(session: folder.SessionFolder) -> MappedPump:
+    """Result of the pump map."""
+    return folder.read(session.file("pump_map.json"), MappedPump)
+
+
+def map_pump(
+    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
+) -> tuple[MappedPump, folder.SessionFolder]:
+    """Measure the pump's curve, apply it on trial, check it with a relay and keep it; the session begins anew on it.
+
+    The gains stay if they suit the measured actuator; else they become slower ones that do. Raises RejectedError with
+    what to do if there is no curve, or the relay contradicts it; the former curve and gains are then in force.
+    """
+    before = rig.pump
+    rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
     try:
-        while steps := survey.steps():
-            spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
-            rows, finished = rig.performed(spec)
-            survey.take(run_of(rows, rig.dt_s), finished.completed)
-            _returned(rig)
-        found = survey.result()
-    except ValueError as error:
+        found = _surveyed(rig, limit_um)
+        loop = _safe(rig.good[0], found)
+        rig.set_gains(loop, "the measured curve of the pump", _MAP_S, found.pump)
+        gain, sigma = _checked(rig)
+    except (characterise.ExperimentError, ValueError) as error:
+        rig.go_back()
         raise errors.RejectedError(f"pump map: {error}") from None
-    rig.set_gains(before, "pump mapped")
-    files.write_text_atomic(files.users(session.file("pump.toml")), config_file.dump(found.pump))
-    folder.write(session.file("pump_map.json"), found)
-    return found
+    rig.keep()
+    rig.good = loop, found.pump
+    session = folder.based_on(session, loop, found.pump)
+    done = MappedPump(found, before, gain, sigma)
+    folder.write(session.file("pump_map.json"), done)
+    return done, session
+
+
+def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
+    around = rig.around(_returned(rig), limit_um)
+    holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
+    survey = pump_survey.PumpSurvey(holding, around.limit_um)
+    while steps := survey.steps():
+        spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
+        rows, finished = rig.performed(spec)
+        survey.take(run_of(rows, rig.dt_s), finished.completed)
+        if survey.in_vain >= _IN_VAIN:
+            raise ValueError(finished.reason)
+        _returned(rig)
+    return survey.result()
+
+
+def _safe(loop: schema.LoopConfig, found: pump_survey.PumpMap) -> schema.LoopConfig:
+    """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this actuator."""
+    model = loop_model.PlantModel(1.0, found.delay_s, found.lag_s, found.leak_um_per_s)
+    margins = loop_model.margins(loop_model.Gains.of(loop), model, 1 / loop.rate_hz)
+    if margins.stable and margins.ms <= MS_MAX:
+        return loop
+    late_s = found.delay_s + found.lag_s + loop.measurement_filter_s + 0.5 / loop.rate_hz
+    return loop.model_copy(update={"kp_per_s": 0.5 / late_s, "ti_s": 8 * late_s, "td_s": 0.0})
+
+
+def _checked(rig: HoldRig) -> tuple[float, float]:
+    """The gain of the mirror on the curve in force, and its error. Raises ValueError if it is far from 1, or bent."""
+    _returned(rig)
+    _, relays, _ = characterise.about_the_hold(rig)
+    found = identify.identify(relays)
+    gain, sigma = found.model.gain, found.sigma.gain
+    quality = characterise.judge(relays, found)
+    if quality.pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma):
+        raise ValueError(
+            f"a relay contradicts the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or the "
+            "pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
+        )
+    return gain, sigma
 
 
 def _returned(rig: HoldRig) -> records.Record:

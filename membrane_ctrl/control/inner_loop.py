@@ -214,6 +214,15 @@ class InnerLoop:
         self.learned = False
         self._drift.spoil()
 
+    def set_pump(self, pump: PumpConfig) -> None:
+        """Take another curve of the pump: the mean flow becomes what that says of the mean command."""
+        mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
+        self._flow_full_um_per_s, self._curve = pump.flow_full_um_per_s, gas.PumpCurve(pump)
+        self._drift, self._probe_um = pump_drift.PumpDrift(DEAD_S, PUMP_LAG_S), pump.probe_um
+        self.set_gains(self._loop)
+        self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
+        self._leak.pause()
+
     def _stand_at(self, setpoint_um: float) -> None:
         """Put everything that follows the setpoint to rest there."""
         self._setpoint_um = self._shaped_um = setpoint_um

@@ -60,6 +60,7 @@ class Request(Section):
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
     text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
+    pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
     experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
     shape_time_constant_s: float | None = None  # `gains`: of the shape loop
     take_over: bool = False  # take command from whoever has it
@@ -69,7 +70,7 @@ class Request(Section):
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         needs, takes = (rule.needs, rule.takes) if rule else ((), ())
-        for name in ("value", "text", "loop", "experiment", "shape_time_constant_s"):
+        for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s"):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
                 raise ValueError(f"{self.do} takes no {name}")

@@ -36,6 +36,7 @@ class RunHooks:
     tell: Callable[[events.Event], None]  # records an event
     now: Callable[[], float]  # the run's clock
     loop: Callable[[], schema.LoopConfig]  # present loop settings
+    pump: Callable[[], schema.PumpConfig]  # likewise
 
 
 class Port:
@@ -204,7 +205,12 @@ class Port:
                 self._tell(run_events.CommanderChanged(None, who, request.why))
             case "quiet":
                 self._tell(run_events.AlarmsAcknowledged(who, request.why))
-        return {"ok": True, "status": self.status(), "loop": self._hooks.loop().model_dump()}
+        return {
+            "ok": True,
+            "status": self.status(),
+            "loop": self._hooks.loop().model_dump(),
+            "pump": self._hooks.pump().model_dump(),
+        }
 
     def _command(self, peer: Peer, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for invalid gains or an invalid experiment."""
@@ -213,11 +219,12 @@ class Port:
         experiment = (
             None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
         )
+        pump = None if request.pump is None else toml_file.parse(request.pump, schema.PumpConfig, "gains: pump")
         value, shape_s = (
             math.nan if number is None else number for number in (request.value, request.shape_time_constant_s)
         )
         return commands.Command(
-            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s
+            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s, pump
         )
 
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.model.states import State
@@ -46,6 +46,7 @@ class Command:
     experiment: ExperimentSpec | None = None  # `tune`: the experiment
     number: int = 0  # chosen by the client, returned with the answer
     shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
+    pump: PumpConfig | None = None  # `gains`: the pump's curve, if it changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,11 @@ TABLE: dict[Kind, CommandRule] = {
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
     "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in um/s of the centre.", needs=("value",)),
     "gains": CommandRule(
-        "tune", RUNNING, "Set gains, on trial or to stay.", needs=("loop",), takes=("value", "shape_time_constant_s")
+        "tune",
+        RUNNING,
+        "Set gains, on trial or to stay.",
+        needs=("loop",),
+        takes=("value", "shape_time_constant_s", "pump"),
     ),
     "keep": CommandRule("tune", RUNNING, "Keep the gains on trial."),
     "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
@@ -133,15 +138,16 @@ def refusal(command: Command, state: State, config: Config) -> str:
 
 
 class GainsTrial:
-    """Gains on trial revert to the last good ones unless kept in time; a run's first gains count as good.
+    """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a run's first are good.
 
     The client that tries them may lose its connection or be killed: the loop must not keep unverified gains
     (docs/decisions/78-gains-on-trial.md).
     """
 
-    def __init__(self, loop: LoopConfig, shape_time_constant_s: float) -> None:
+    def __init__(self, loop: LoopConfig, shape_time_constant_s: float, pump: PumpConfig) -> None:
         self._good = self._tried = loop
         self._good_shape_s = self._tried_shape_s = shape_time_constant_s
+        self._good_pump = self._tried_pump = pump
         self._until_s = math.nan
 
     @property
@@ -149,9 +155,16 @@ class GainsTrial:
         """The present gains are not kept yet."""
         return math.isfinite(self._until_s)
 
-    def begin(self, loop: LoopConfig, now_s: float, trial_s: float, shape_time_constant_s: float = math.nan) -> None:
+    def begin(
+        self,
+        loop: LoopConfig,
+        now_s: float,
+        trial_s: float,
+        shape_time_constant_s: float = math.nan,
+        pump: PumpConfig | None = None,
+    ) -> None:
         """Set new gains for `trial_s` seconds, or permanently if that is NaN."""
-        self._tried = loop
+        self._tried, self._tried_pump = loop, pump or self._tried_pump
         if math.isfinite(shape_time_constant_s):
             self._tried_shape_s = shape_time_constant_s
         self._until_s = now_s + trial_s
@@ -163,15 +176,22 @@ class GainsTrial:
         """The shape loop's time constant now in force."""
         return self._tried_shape_s
 
+    @property
+    def pump(self) -> PumpConfig:
+        """The pump's curve now in force."""
+        return self._tried_pump
+
     def keep(self) -> None:
         """Keep the present gains."""
         self._good, self._good_shape_s, self._until_s = self._tried, self._tried_shape_s, math.nan
+        self._good_pump = self._tried_pump
 
     def overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
         return now_s >= self._until_s
 
     def revert(self) -> LoopConfig:
-        """Restore and return the last good gains."""
+        """Restore the last good settings, and return the gains."""
         self._tried, self._tried_shape_s, self._until_s = self._good, self._good_shape_s, math.nan
+        self._tried_pump = self._good_pump
         return self._good

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller import (
@@ -49,9 +49,11 @@ class Controller:
         observer = Observer(config.limits)
         loop = inner_loop.InnerLoop(config.loop, config.pump)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
-        self._scene = Scene(config, config.loop, loop, observer, levels, standstill, config.loop.setpoint_um)
+        self._scene = Scene(
+            config, config.loop, config.pump, loop, observer, levels, standstill, config.loop.setpoint_um
+        )
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
-        self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s)
+        self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s, config.pump)
         self._consistency = sensor_consistency.SensorConsistency(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -68,6 +70,11 @@ class Controller:
     def loop_config(self) -> LoopConfig:
         """The loop's present settings."""
         return self._scene.loop_config
+
+    @property
+    def pump_config(self) -> PumpConfig:
+        """The pump's curve in force."""
+        return self._scene.pump_config
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
         """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
@@ -156,14 +163,15 @@ class Controller:
             or self._prepare(command)
         )
         self._answers.append((command.number, refused))
+        spec = command.experiment
         taken = told.CommandTaken(
             command=command.kind,
             who=command.who,
             why=command.why,
             value=_or_none(command.value),
             text=command.text or None,
-            loop=None if command.loop is None else command.loop.model_dump(),
-            experiment=None if command.experiment is None else command.experiment.model_dump(),
+            loop=_settings(command),
+            experiment=None if spec is None else spec.model_dump(exclude=None if spec.steps else {"steps"}),
             shape_time_constant_s=_or_none(command.shape_time_constant_s),
             refused=refused or None,
         )
@@ -186,7 +194,9 @@ class Controller:
                 scene.setpoint_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
-                self._gains.begin(command.loop, scene.now_s, command.value, command.shape_time_constant_s)
+                self._gains.begin(
+                    command.loop, scene.now_s, command.value, command.shape_time_constant_s, command.pump
+                )
                 self._set_gains(command.loop)
             case "keep":
                 self._gains.keep()
@@ -223,15 +233,18 @@ class Controller:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
         try:
-            scene.trial = trial.Trial(spec, scene.loop_config, self._config.pump, centre_um)
+            scene.trial = trial.Trial(spec, scene.loop_config, scene.pump_config, centre_um)
         except ValueError as error:
             return str(error)
         scene.hold_wanted = False
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
-        self._scene.loop_config = loop
-        self._scene.loop.set_gains(loop)
+        scene, pump = self._scene, self._gains.pump
+        if pump != scene.pump_config:
+            scene.loop.set_pump(pump)
+        scene.loop_config, scene.pump_config = loop, pump
+        scene.loop.set_gains(loop)
         self._shape.set_memory(self._gains.shape_time_constant_s)
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
@@ -350,3 +363,10 @@ class Controller:
 
 def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _settings(command: commands.Command) -> dict[str, object] | None:
+    """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
+    if command.loop is None:
+        return None
+    return command.loop.model_dump() | ({} if command.pump is None else {"pump": command.pump.model_dump()})

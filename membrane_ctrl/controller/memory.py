@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, PumpConfig
+from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import pump_obeys, safety, safety_rules
 from membrane_ctrl.controller.controller import Controller
@@ -36,7 +37,9 @@ def remember(controller: Controller) -> bytes:
 def recall(memory: bytes, fresh: Controller) -> Controller:
     """Restore a memory into `fresh`, a new controller of the same configuration. Raises UnknownMemoryError."""
     config = fresh._config
-    examples = (fresh, pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz))
+    measured = gas.PumpCurve(PumpConfig(curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 1.0), flow_full_um_per_s=1.0))
+    test = pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz)
+    examples = (fresh, test, gas.PumpCurve(PumpConfig()), measured)
     decoder = object_codec.Decoder(examples, _specials(config))
     try:
         expander = zlib.decompressobj()

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import filters, inner_loop, shape_loop
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
@@ -36,6 +36,7 @@ class Scene:
 
     config: Config
     loop_config: LoopConfig  # present settings, after `gains`
+    pump_config: PumpConfig  # likewise
     loop: inner_loop.InnerLoop
     observer: Observer
     levels: safe_levels.SafeLevels

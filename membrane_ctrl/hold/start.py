@@ -224,7 +224,8 @@ async def _run(
         wiring = _wiring(bench, rings, children, twin, stack)
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
-        port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, lambda: controller.loop_config))
+        settings = (lambda: controller.loop_config, lambda: controller.pump_config)
+        port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings))
         latch, systemd = latch_for(supervisor.tell), SystemdNotify()
         wiring.heard = {
             "control port": port.heard,

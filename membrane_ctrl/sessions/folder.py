@@ -4,7 +4,7 @@ import json
 import math
 import re
 import types
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -164,6 +164,16 @@ class SessionFolder:
                     raise errors.InputError(
                         f"{self.file(name)}: cannot be removed ({errors.os_reason(error)})"
                     ) from None
+
+
+def based_on(session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig) -> SessionFolder:
+    """The session, begun anew on other gains and another curve of the pump, which are in force."""
+    session.begin(STEPS[0])
+    head = replace(session.head, before=before)
+    config = session.config.model_copy(update={"loop": before, "pump": pump})
+    files.write_text_atomic(session.file("config.toml"), toml_file.dump(config))
+    write(session.file("session.json"), head)
+    return SessionFolder(session.path, head, config)
 
 
 def fresh_folder(parent: Path, name: str, now: datetime) -> Path:

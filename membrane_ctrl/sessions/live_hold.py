@@ -79,9 +79,13 @@ class LiveHold:
         self._client, self._take_over = client, take_over
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
-        loop = schema.LoopConfig.model_validate(client.ask(do="status")["loop"])
+        status = client.ask(do="status")
+        loop, pump = (
+            kind.model_validate(status[name])
+            for name, kind in (("loop", schema.LoopConfig), ("pump", schema.PumpConfig))
+        )
         config = toml_file.load(run_dir / "config.toml", schema.Config)
-        self.config = config.model_copy(update={"loop": loop})
+        self.config = config.model_copy(update={"loop": loop, "pump": pump})
         self.name, self.run_dir = run_dir.name, run_dir
         try:
             self._readers = attach(run_dir)
@@ -100,6 +104,8 @@ class LiveHold:
             request["shape_time_constant_s"] = command.shape_time_constant_s
         if command.loop is not None:
             request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
+        if command.pump is not None:
+            request["pump"] = command.pump.model_dump()
         if command.experiment is not None:
             request["experiment"] = command.experiment.model_dump()
         try:

@@ -13,7 +13,7 @@ from typing import Any
 
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.config.port import PortConfig
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.session import Peer
 from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listeners_for
@@ -58,7 +58,7 @@ class PortRun:
         more = port_config.model_copy(update={"socket": str(folder / "unused.sock")})
         others = listeners_for(more, folder, self._stack)
         self.listeners = Listeners(self.listener, others.tls, others.metrics, self.path)
-        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop)
+        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop, PumpConfig)
         self.port = Port(port_config, self.listeners, "the-run", hooks)
 
     async def somebody_asked(self) -> None:

@@ -10,6 +10,8 @@ from tuning.identification.disturbance import SLOWEST_S
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
+_MAP_THE_PUMP = "run `tune pump`"
+
 # Whether the data support a proposal; if not, the problem and the experiment that would help.
 
 _LOST_MAX = 0.01
@@ -31,6 +33,11 @@ class FitQuality:
     # "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal
     verdict: Literal["ok", "degraded", "refused"]
     reasons: tuple[str, ...]  # the findings, each with a remedy
+
+    @property
+    def pump_unknown(self) -> bool:
+        """Refused because the pump is not what it is taken for."""
+        return self.verdict == "refused" and any(_MAP_THE_PUMP in reason for reason in self.reasons)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,21 +81,21 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"{record.lost_fraction:.0%} of the laser's readings were lost: check the laser, repeat")
     if model.gain < _UNANSWERED * sigma.gain:
         refused.append(
-            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): run the pump map"
+            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {_MAP_THE_PUMP}"
         )
         return refused, degraded
     if identified.largest_residual > _JUMP_SIGMAS:
         at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
         refused.append(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay")
     if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
-        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: run the relay for longer")
+        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: repeat `tune characterise`")
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
         degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
     if sigma.delay_s > _DELAY_SIGMA_MAX_S:
-        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: run the doublets")
+        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: repeat `tune characterise`")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append("the residuals follow the flow (a saturating or sticking pump?): run the pump map")
+        degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {_MAP_THE_PUMP}")
     if identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded
@@ -102,7 +109,7 @@ def _bent(record: Record, identified: Identified) -> list[str]:
         return []
     what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
     gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
-    return [f"{what} ({gains}): run the pump map and set [pump] from it"]
+    return [f"{what} ({gains}): {_MAP_THE_PUMP}"]
 
 
 _GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma

@@ -17,11 +17,13 @@ from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
+_USEFUL_SHARE = 0.02  # beyond it there is no curve
 _BENT_SHARE = 0.03  # a level that its neighbours predict worse than this gets nearer neighbours
 _JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 30, 900.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
+_LEAST_S = 4.0  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
@@ -60,6 +62,7 @@ class PumpSurvey:
     limit_um: float = 10.0
     runs: list[PumpRun] = field(default_factory=list)
     fit: PumpFit = field(default_factory=lambda: PumpFit({}, 0.0, 0.0, 0.0, 0.8))
+    in_vain: int = 0  # the latest runs that were over at once
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _rounds: int = 0
     _wanted: set[Level] = field(default_factory=set)
@@ -74,8 +77,11 @@ class PumpSurvey:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
         self._share = min(1.0, self._share * (1.2 if completed else 0.8))
-        if run.fraction.size * run.dt_s > 4.0:
+        if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
+            self.in_vain = 0
+        else:
+            self.in_vain += 1
         if self.runs:
             self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
             self._branches = {rising: self._branch(rising) for rising in (True, False)}
@@ -285,19 +291,28 @@ class PumpSurvey:
 
         if not self.fit.levels:
             raise ValueError(
-                "the experiments were stopped too early: steadier weather, or a larger limit, would help"
+                "the experiments were stopped too early: run `tune pump` again in steadier weather, or with a larger "
+                "--limit-um"
             )
         fractions, flows, sigmas = self._branches[True].columns
-        leak, full = self.fit.leak_um_per_s, float(flows[-1])
-        if full < max(5 * float(sigmas[-1]), 0.1 * abs(leak)):
+        if not (flows > np.maximum(5 * sigmas, 0.1 * abs(self.fit.leak_um_per_s))).any():
             raise ValueError(
-                f"the mirror moves alike at every command ({full:.2f} +- {sigmas[-1]:.2f} um/s more at "
-                f"{fractions[-1]:.2f} than at 0): the pump is stuck, or its gas does not arrive"
+                f"the mirror moves alike at every command ({flows[-1]:.2f} +- {sigmas[-1]:.2f} um/s more at "
+                f"{fractions[-1]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
+                "`tune pump` again"
             )
+        known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
+        if not known.all():
+            raise ValueError(
+                f"the flow at {fractions[~known][0]:.2f} is known to {sigmas.max():.2f} um/s only after "
+                f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
+                "or in steadier weather"
+            )
+        leak, full = self.fit.leak_um_per_s, float(flows[-1])
         if full < leak:
             raise ValueError(
                 f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
-                "take a stronger pump"
+                "take a stronger pump, then run `tune pump` again"
             )
         start, above = self.start(), self._branches[False].columns
         begin, stall = 0.0, 0.0
