@@ -14,7 +14,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Protocol
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.filters import LagRate
@@ -26,18 +25,6 @@ STALL_MARGIN = 0.005
 KICK_S = 0.1
 
 _PER_INTERVAL = 16  # chords of the cubic between two points: within 0.1 % of its rise
-
-
-class _Branch(Protocol):
-    """A rising curve and its inverse."""
-
-    highest_fraction: float
-
-    def flow(self, fraction: float) -> float:
-        """Flow in um/s for a command."""
-
-    def fraction(self, flow_um_per_s: float) -> float:
-        """Command for a flow."""
 
 
 class _StraightLine:
@@ -72,7 +59,7 @@ class _Measured:
         return _between(self._flows, self._fractions, flow_um_per_s)
 
 
-def _branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _Branch:
+def branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
     """One branch of the pump's own: no two share one, because a controller's memory is a tree."""
     return _Measured(pump.curve_fraction, flows_um_per_s) if flows_um_per_s else _StraightLine(pump)
 
@@ -125,8 +112,8 @@ class PumpCurve:
     def __init__(self, pump: PumpConfig) -> None:
         self._start_fraction = pump.start_fraction
         self._least_fraction = pump.stall_fraction + STALL_MARGIN
-        self._rising = _branch(pump, pump.curve_um_per_s)
-        self._falling = _branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
+        self._rising: _StraightLine | _Measured = branch(pump, pump.curve_um_per_s)
+        self._falling: _StraightLine | _Measured = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
         self._flow_um_per_s = 0.0
         self._kick_left_s = KICK_S
 

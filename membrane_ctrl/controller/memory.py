@@ -37,9 +37,10 @@ def remember(controller: Controller) -> bytes:
 def recall(memory: bytes, fresh: Controller) -> Controller:
     """Restore a memory into `fresh`, a new controller of the same configuration. Raises UnknownMemoryError."""
     config = fresh._config
-    measured = gas.PumpCurve(PumpConfig(curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 1.0), flow_full_um_per_s=1.0))
+    curve = PumpConfig(curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 1.0), flow_full_um_per_s=1.0)
+    curves = (gas.branch(curve, ()), gas.branch(curve, curve.curve_um_per_s))  # either may be in force
     test = pump_obeys.ActuatorTest(config.pump, test_vent=True, rate_hz=config.loop.rate_hz)
-    examples = (fresh, test, gas.PumpCurve(PumpConfig()), measured)
+    examples = (fresh, test, *curves)
     decoder = object_codec.Decoder(examples, _specials(config))
     try:
         expander = zlib.decompressobj()

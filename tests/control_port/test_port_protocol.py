@@ -70,6 +70,7 @@ def test_every_command_of_the_table_can_be_asked() -> None:
         (line(do="stop", why="y" * 301), "longer than 300 bytes"),
         (line(do="gains"), "loop missing"),
         (line(do="gains", loop={"kp_per_s": "much"}), "loop.kp_per_s"),
+        (line(do="setpoint", value=1.0, pump={}), "setpoint takes no pump"),
         (line(do="stop", number=-1), "number"),
         (line(do="stop", number=10**30), "number"),
         (line(do="watch", period_s=0.0), "period_s"),

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.memory import recall, remember
 from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
@@ -269,6 +270,53 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
     assert told(tried(60.0, 1.0))[1] == 60.0
     assert told()[1] == 90.0
     assert "outside" in refusal(tried(0.5), State.HOLD, CONFIG)
+
+
+# Twice the true flow at every command: on it the mirror seems to lose twice its leak.
+TWICE = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 10.6), flow_full_um_per_s=10.6)
+
+
+def on_curve(pump: PumpConfig, trial_s: float) -> Command:
+    return replace(gains(0.3, trial_s), pump=pump)
+
+
+def mean_flow(held: Held) -> float:
+    return float(np.mean([row.flow_um_per_s for row in held.rows[-300:]]))
+
+
+def test_a_curve_on_trial_changes_what_the_flow_means_not_the_mirror_and_goes_back_by_itself() -> None:
+    held = Held()
+    held.go(8.0, on_curve(TWICE, 10.0))
+    assert mean_flow(held) == pytest.approx(2 * 1.24, rel=0.15)
+    assert held.of("command")[-1]["loop"]["pump"]["flow_full_um_per_s"] == 10.6
+    held.go(10.0)
+    assert held.of("gains_reverted")[-1]["why"] == "nobody kept them in time"
+    assert mean_flow(held) == pytest.approx(1.24, rel=0.15)
+    assert held._run._supervisor._controller.pump_config == CONFIG.pump
+    assert held.furthest_um(BEGIN_S) < 2.0
+
+
+def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recalled() -> None:
+    held = Held()
+    held.go(2.0, on_curve(TWICE, 60.0))
+    held.go(2.0, Command("keep", "tester"))
+    held.go(4.0, gains(0.5, 2.0))
+    assert held.of("gains_reverted")
+    controller = held._run._supervisor._controller
+    assert controller.pump_config == TWICE
+    again = recall(remember(controller), Controller(CONFIG, zernike_projection()))
+    assert again.pump_config == TWICE
+    assert again._scene.loop._curve.flow(1.0) == 10.6
+
+
+def test_the_events_of_older_commands_have_no_new_keys() -> None:
+    """Their words are in the checksum of a replay."""
+    held = Held()
+    held.go(0.1, gains(0.3, 5.0))
+    held.go(0.1, tune())
+    settings, experiment = held.of("command")[-2]["loop"], held.of("command")[-1]["experiment"]
+    assert set(settings) == set(LoopConfig.model_fields)
+    assert "steps" not in experiment
 
 
 def test_a_trial_of_no_time_is_refused() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from patience import slow_machine
 
+from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model.errors import DeviceError, InputError
@@ -78,11 +79,13 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     assert finished.completed, finished.reason
     assert 12.0 <= record.duration_s < 24.0
     assert record.lost_fraction < 0.3  # a machine that pauses twice skips ticks; they are counted, not hidden
-    rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0)
+    curve = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 5.3), flow_full_um_per_s=5.3)
+    rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0, curve)
     rig.keep()
     link.close()
     again = connected(logs)
     assert again.config.loop.kp_per_s == 0.4  # a later session starts from what runs
+    assert again.config.pump == curve
     again.close()
 
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
 from tuning import choice
 from tuning.gains_file import entries, entry, note
-from tuning.session import Verified
+from tuning.identification.pump_survey import PumpMap
+from tuning.session import MappedPump, Verified
 
 BEFORE = LoopConfig()
 GAINS = {"kp_per_s": 0.448, "ti_s": 8.79, "measurement_filter_s": 0.1, "temperature_gain_um_per_k": 121.5}
@@ -209,3 +210,37 @@ def test_what_cannot_be_edited_says_what_to_set(
     assert saved(tmp_path / "lab.toml", "--yes") == Exit.BAD_INPUT
     assert "set in [loop]: kp_per_s = 0.448, ti_s = 8.79" in capsys.readouterr().err
     assert set(choice.GAIN_KEYS) <= set(LoopConfig.model_fields)
+
+
+CURVE = PumpConfig(curve_fraction=(0.1, 0.5, 1.0), curve_um_per_s=(0.0, 1.5, 6.0), start_fraction=0.2)
+
+
+def mapped_session(logs: Path, text: str) -> Path:
+    """A session that measured a curve, slowed the gains and went no further."""
+    (logs / "before.toml").write_text(text)
+    config = load(logs / "before.toml", Config)
+    session = plain.create_session(logs, "s2", "eve", "a-run", config, config.loop)
+    found = PumpMap((0.1, 1.0), (0.0, 6.0), (0.0, 0.1), CURVE, 1.2, 1.0, 0.2, 600.0, True)
+    plain.write(session.file("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02))
+    return plain.based_on(session, config.loop.model_copy(update={"kp_per_s": 0.3}), CURVE).path
+
+
+def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = TEXT + "[pump]\nstall_fraction = 0.1  # as wired\n"
+    session, path = mapped_session(tmp_path, text), tmp_path / "lab.toml"
+    assert saved(path, str(session), "--yes", text=text) == Exit.DONE
+    now = load(path, Config)
+    assert now.pump == CURVE
+    assert now.loop.kp_per_s == 0.3
+    assert "# agreed with optics" in path.read_text()
+    capsys.readouterr()
+    assert run(["tune", "save", "--config", str(path), str(session)]) == Exit.DONE
+    assert "already has" in capsys.readouterr().out
+
+
+def test_a_curve_is_not_saved_over_that_of_another_pump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session, path = mapped_session(tmp_path, TEXT), tmp_path / "lab.toml"
+    assert saved(path, str(session), "--yes", text=TEXT + "[pump]\nflow_full_um_per_s = 9.0\n") == Exit.BAD_INPUT
+    assert "pump.flow_full_um_per_s" in capsys.readouterr().err

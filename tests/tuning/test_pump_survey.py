@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from membrane_ctrl.cli import run
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
+from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.control.gas import PumpCurve
-from membrane_ctrl.model.errors import RejectedError
+from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.states import State
-from membrane_ctrl.sessions.folder import create_session
+from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
 from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tuning import command as tune
 from tuning import session
+from tuning.identification.loop_model import Gains, PlantModel, margins
 from tuning.identification.pump_curve import Level, PumpRun, fit
+from tuning.identification.pump_survey import PumpMap
 from tuning.rig import HoldRig
 from tuning.twin_hold import TwinHold
 
@@ -61,15 +68,22 @@ def test_runs_without_readings_are_refused() -> None:
         fit([PumpRun(DT_S, np.full(100, 0.3), np.full(100, math.nan), np.full(100, math.nan))])
 
 
-def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[session.pump_survey.PumpMap, TwinHold]:
-    """A session's pump map on a bench of the second world, in a hold with the default configuration."""
-    link = TwinHold(foreign_config(rate_hz=20.0), bench=foreign_bench(plant))
+def started(tmp_path: Path, plant: ForeignPlant, **loop: float) -> tuple[TwinHold, HoldRig, SessionFolder]:
+    """A session on a bench of the second world, in a hold with the default configuration."""
+    link = TwinHold(foreign_config(**{"rate_hz": 20.0, **loop}), bench=foreign_bench(plant))
     rig = HoldRig(link, "tester")
-    folder = create_session(tmp_path, "foreign", "tester", link.name, link.config, rig.loop)
-    return session.map_pump(folder, rig), link
+    return link, rig, create_session(tmp_path, "foreign", "tester", link.name, link.config, rig.loop)
 
 
-def worst_share(found: session.pump_survey.PumpMap, pump: ForeignPump) -> float:
+def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
+    """A session's pump map."""
+    link, rig, folder = started(tmp_path, plant)
+    done, folder = session.map_pump(folder, rig)
+    assert (folder.head.before, folder.config.pump) == (rig.loop, done.found.pump)
+    return done.found, link
+
+
+def worst_share(found: PumpMap, pump: ForeignPump) -> float:
     """Largest error of the flow over the curve, from the start on, as a share of the full flow."""
     curve = PumpCurve(found.pump)
     low = max(found.pump.start_fraction, found.pump.curve_fraction[0])
@@ -100,13 +114,115 @@ def test_every_actuator_is_mapped(tmp_path: Path, shape: str, gusts: bool) -> No
     assert bool(found.pump.curve_falling_um_per_s) == (shape == "hysteretic")
 
 
-def test_a_stuck_pump_is_told(tmp_path: Path) -> None:
+class ForeignHold(TwinHold):
+    """What `--twin` starts: a hold on this plant; the bench of the last one can be broken."""
+
+    plant: ForeignPlant
+    last: ForeignHold
+    stuck_fraction = math.nan
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config, bench=foreign_bench(self.plant))
+        ForeignHold.last = self
+        for _ in range(40):
+            self.news()
+        self.bench.wrong.pump_stuck_fraction = self.stuck_fraction
+
+    def close(self) -> None:
+        """The hold outlives its session."""
+
+
+def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    """Exit code of `tune` on that hold."""
+    monkeypatch.setattr(tune.twin_hold, "TwinHold", ForeignHold)
+    config = tmp_path / "foreign.toml"
+    config.write_text(dump(foreign_config(rate_hz=20.0)))
+    return run(["tune", *words, "--twin", "--config", str(config), "--logs", str(tmp_path)])
+
+
+def test_a_stuck_pump_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It goes on giving what holds the mirror, whatever it is told."""
-    plant = ForeignPlant(ForeignPump("straight", 5.3), laser_um=0.5, weather=0.3)
-    link = TwinHold(foreign_config(rate_hz=20.0), bench=foreign_bench(plant))
-    rig = HoldRig(link, "tester")
-    rig.hold(20.0)
-    link.bench.wrong.pump_stuck_fraction = 0.31
-    folder = create_session(tmp_path, "stuck", "tester", link.name, link.config, rig.loop)
-    with pytest.raises(RejectedError, match="alike at every command"):
-        session.map_pump(folder, rig)
+    ForeignHold.plant = ForeignPlant(ForeignPump("straight", 5.3), laser_um=0.5, weather=0.3)
+    monkeypatch.setattr(ForeignHold, "stuck_fraction", 0.31)
+    assert tuned(tmp_path, monkeypatch, "pump") == Exit.REJECTED
+    said = capsys.readouterr().err
+    assert "alike at every command" in said
+    assert "Traceback" not in said
+    link = ForeignHold.last
+    assert link.rows[-1].state == State.HOLD
+    link.bench.wrong.pump_stuck_fraction = math.nan
+    for _ in range(240):
+        link.news()
+    assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])  # with the former gains and curve
+
+
+def flat_map(pump: PumpConfig) -> PumpMap:
+    return PumpMap((0.1, 1.0), (0.0, 5.0), (0.0, 0.1), pump, 1.24, 0.1, 0.1, 600.0, True)
+
+
+@pytest.mark.parametrize("strength", [1.0, 2.0])
+def test_only_a_curve_that_a_relay_confirms_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strength: float
+) -> None:
+    """The pump is as strong as this, and so is the map; another time the map says twice as much."""
+    link, rig, folder = started(
+        tmp_path, ForeignPlant(ForeignPump("straight", 5.0), laser_um=0.4, weather=0.3), rate_hz=10.0
+    )
+    full = 5.0 * strength
+    wrong = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full)
+    monkeypatch.setattr(session, "_surveyed", lambda rig, limit_um: flat_map(wrong))
+    before = rig.loop, rig.pump
+    if strength == 1.0:
+        done, _ = session.map_pump(folder, rig)
+        assert done.gain == pytest.approx(1.0, abs=0.1)
+        assert done.before == before[1]
+        assert rig.pump == wrong
+    else:
+        with pytest.raises(RejectedError, match=r"relay contradicts the curve .* run `tune pump` again"):
+            session.map_pump(folder, rig)
+        assert (rig.loop, rig.pump) == before
+        assert not session.mapped(folder)
+        assert open_session(folder.path).config == link.config
+    rig.hold(40.0)
+    assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])
+
+
+def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
+    loop = LoopConfig(feedforward_barometer=False)
+    quick, late = flat_map(PumpConfig()), replace(flat_map(PumpConfig()), delay_s=1.2, lag_s=0.3)
+    assert session._safe(loop, quick) == loop
+    safe = session._safe(loop, late)
+    model = PlantModel(1.0, 1.2, 0.3, 1.24)
+    assert margins(Gains.of(safe), model, 0.02).ms < 1.75
+    assert not margins(Gains.of(loop), model, 0.02).ms < 1.75
+
+
+@pytest.mark.campaign
+def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A quadratic diaphragm that starts at 0.22, 1.2 s late: from the defaults to verified gains, by one command."""
+    pump = ForeignPump("quadratic", 6.0, 1.0, 0.2, start=0.22, stall=0.2)
+    ForeignHold.plant = ForeignPlant(pump, seed=4, laser_um=0.5, weather=0.6)
+    assert tuned(tmp_path, monkeypatch, "run", "--yes") == Exit.DONE
+    said = capsys.readouterr().err
+    assert "run `tune pump`" in said  # the relay saw the bend, and the session went on by itself
+    assert "verify: kept" in said
+    assert all(abs(row.truth_displacement_um) < 3.0 for row in ForeignHold.last.rows[-6000:])
+    config = tmp_path / "foreign.toml"
+    assert run(["tune", "save", "--config", str(config), "--logs", str(tmp_path), "--yes"]) == Exit.DONE
+    saved = load(config, Config)
+    flow = PumpCurve(saved.pump)
+    assert all(abs(flow.flow(d) - pump.settled(d)) < 0.03 * 6.0 for d in np.linspace(0.25, 1.0, 50))
+
+
+@pytest.mark.campaign
+def test_a_straight_pump_is_tuned_without_a_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ForeignHold.plant = ForeignPlant(ForeignPump("straight", 5.3, start=0.22, stall=0.15), laser_um=0.5)
+    assert tuned(tmp_path, monkeypatch, "run", "--yes") == Exit.DONE
+    assert "pump:" not in capsys.readouterr().err
+    assert ForeignHold.last.rows[-1].mono_s < 1700.0

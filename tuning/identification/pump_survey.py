@@ -18,16 +18,20 @@ from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, Pum
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _USEFUL_SHARE = 0.02  # beyond it there is no curve
-_BENT_SHARE = 0.03  # a level that its neighbours predict worse than this gets nearer neighbours
+_REACHES_LEAKS = 1.2
+_BENT_SHARE = 0.02  # a level that its neighbours predict worse than this gets nearer neighbours
+_PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
-_MOST_ROUNDS, _MOST_S, _ROUND_S = 30, 900.0, 120.0
+_MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 4.0  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
+_ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
+_FIRST_ROUNDS = 5  # without any flow
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 
@@ -91,6 +95,8 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if not self._sure()[0].size:
+            if self._rounds >= _FIRST_ROUNDS:
+                return ()
             first = min(1.0, self.holding_fraction + 0.1)
             pulses = [
                 (_for(0.0, 20.0, -1.5), _for(first, longest_s * self._share, 1.0), _for(0.0, 0.5))
@@ -154,7 +160,7 @@ class PumpSurvey:
                 continue
             more = above.flow_um_per_s - below.flow_um_per_s
             sigma = math.hypot(above.sigma_um_per_s, below.sigma_um_per_s)
-            if more > max(3 * sigma, _BENT_SHARE * self.full_um_per_s):
+            if more > max(3 * sigma, _PLAY_SHARE * self.full_um_per_s):
                 return True
         return False
 
@@ -169,7 +175,7 @@ class PumpSurvey:
             self._wanted |= {Level(f) for f in self._finer(True)}
         if any(not level.rising for level in self._wanted):
             self._wanted |= {Level(f, False) for f in self._finer(False)}
-        if (seen and self.start() is not None) or self.done:
+        if seen:
             self._wanted |= {Level(f, False) for f in self._from_above()}
 
     @property
@@ -194,7 +200,7 @@ class PumpSurvey:
             others = np.arange(fractions.size) != i
             off = abs(float(PchipInterpolator(fractions[others], flows[others])(fractions[i])) - flows[i])
             for low, high in pairwise(fractions[i - 1 : i + 2].tolist()):
-                if off > _BENT_SHARE * full + 2 * sigmas[i] and high - low > _NEAREST:
+                if off > _BENT_SHARE * full + sigmas[i] and high - low > _NEAREST:
                     found.append(_rounded((low + high) / 2))
         return found
 
@@ -275,9 +281,8 @@ class PumpSurvey:
         )
 
     def _higher(self, level: Level) -> float:
-        """A larger command, from which a level is reached."""
-        above = [other.fraction for other in self._wanted if other.fraction > level.fraction + 0.05]
-        return min(above, default=1.0)
+        """A larger command, from which a level is reached: beyond any hysteresis."""
+        return min(1.0, level.fraction + _ABOVE)
 
     def _up(self) -> float:
         """The smallest known command that lifts the mirror well; the largest if none does."""
@@ -302,13 +307,15 @@ class PumpSurvey:
                 "`tune pump` again"
             )
         known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
-        if not known.all():
+        top = int(np.flatnonzero(known)[-1]) + 1  # no command beyond is given
+        leak, full = self.fit.leak_um_per_s, float(flows[top - 1])
+        if not known[:top].all() or (top < known.size and full < _REACHES_LEAKS * leak):
             raise ValueError(
-                f"the flow at {fractions[~known][0]:.2f} is known to {sigmas.max():.2f} um/s only after "
+                f"the flow at {fractions[~known][0]:.2f} is known to {sigmas[~known][0]:.2f} um/s only after "
                 f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
                 "or in steadier weather"
             )
-        leak, full = self.fit.leak_um_per_s, float(flows[-1])
+        fractions, flows, sigmas = fractions[:top], flows[:top], sigmas[:top]
         if full < leak:
             raise ValueError(
                 f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
