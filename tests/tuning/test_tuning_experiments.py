@@ -131,7 +131,7 @@ def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     found = characterise(rig).quality
     assert found.verdict == "refused"
-    assert any("the pump saturates" in reason and "pump map" in reason for reason in found.reasons)
+    assert any("the pump saturates" in reason and "run `tune pump`" in reason for reason in found.reasons)
     assert held_again(rig, bench)
 
 

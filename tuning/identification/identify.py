@@ -103,7 +103,7 @@ def identify(record: records.Record) -> Identified:
     if len(record) < 10 * _LAGS:
         raise ValueError(f"{record.duration_s:.1f} s is too short for an identification")
     if np.ptp(record.flow_um_per_s) <= 0:
-        raise ValueError("the flow never changed: run the relay experiment")
+        raise ValueError("the flow never changed: repeat `tune characterise`")
 
     def errors(q: records.Series) -> records.Series:
         model = loop_model.PlantModel(q[0], q[1], q[2], q[3])
