@@ -147,7 +147,7 @@ def _map_pump(folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Pr
         f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s"
     )
     progress.say(
-        f"pump: a relay on this curve gives k {mapped.gain:.2f} +- {mapped.gain_sigma:.2f}; curve and gains "
+        f"pump: steps of the flow on this curve give k {mapped.gain:.2f} +- {mapped.gain_sigma:.2f}; curve and gains "
         f"({_gains_words(rig.loop)}) stay until the hold ends; `membrane-ctrl tune save {folder.path} --config FILE` "
         "saves them for the next one"
     )

@@ -5,7 +5,7 @@ Steps that move the mirror take a `HoldRig`; the others run anywhere, at any lat
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -318,7 +318,8 @@ def verified_of(session: folder.SessionFolder) -> Verified:
 # Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0}
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
-_IN_VAIN = 5  # experiments in a row that are over at once
+_DARK_MOST = 3  # experiments in a row that a lost laser ended
+_CHECK_BEFORE_S, _CHECK_S, _CHECK_AFTER_S = 40.0, 120.0, 15.0
 _CURVE_OFF = 0.2  # of k; the margins tolerate more
 
 
@@ -328,7 +329,7 @@ class MappedPump:
 
     found: pump_survey.PumpMap
     before: schema.PumpConfig
-    gain: float  # of the mirror on the curve, from a relay: 1
+    gain: float  # of the mirror on the curve, from steps of the flow: 1
     gain_sigma: float
 
 
@@ -345,15 +346,16 @@ def mapped_of(session: folder.SessionFolder) -> MappedPump:
 def map_pump(
     session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
 ) -> tuple[MappedPump, folder.SessionFolder]:
-    """Measure the pump's curve, apply it on trial, check it with a relay and keep it; the session begins anew on it.
+    """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
-    The gains stay if they suit the measured actuator; else they become slower ones that do. Raises RejectedError with
-    what to do if there is no curve, or the relay contradicts it; the former curve and gains are then in force.
+    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones that do. Raises RejectedError with
+    what to do if there is no curve, or the steps contradict it; the former curve and gains are then in force.
     """
     before = rig.pump
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
     try:
         found = _surveyed(rig, limit_um)
+        found = replace(found, pump=found.pump.model_copy(update={"probe_um": before.probe_um}))
         loop = _safe(rig.good[0], found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, found.pump)
         gain, sigma = _checked(rig)
@@ -376,7 +378,7 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         survey.take(run_of(rows, rig.dt_s), finished.completed)
-        if survey.in_vain >= _IN_VAIN:
+        if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
         _returned(rig)
     return survey.result()
@@ -393,16 +395,21 @@ def _safe(loop: schema.LoopConfig, found: pump_survey.PumpMap) -> schema.LoopCon
 
 
 def _checked(rig: HoldRig) -> tuple[float, float]:
-    """The gain of the mirror on the curve in force, and its error. Raises ValueError if it is far from 1, or bent."""
+    """The gain of the mirror on the curve in force, and its error, from steps of the flow.
+
+    Raises ValueError if it is far from 1, or differs above and below the holding flow.
+    """
     _returned(rig)
-    _, relays, _ = characterise.about_the_hold(rig)
-    found = identify.identify(relays)
+    rig.hold(_CHECK_AFTER_S)
+    around = rig.around(rig.hold(_CHECK_BEFORE_S))
+    machine.room(around)
+    record, _ = rig.perform(characterise.spec_of("steps", around, _CHECK_S))
+    found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))
     gain, sigma = found.model.gain, found.sigma.gain
-    quality = characterise.judge(relays, found)
-    if quality.pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma):
+    if characterise.judge(record, found).pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma):
         raise ValueError(
-            f"a relay contradicts the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or the "
-            "pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
+            f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
+            "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
         )
     return gain, sigma
 

@@ -163,7 +163,7 @@ def flat_map(pump: PumpConfig) -> PumpMap:
 
 
 @pytest.mark.parametrize("strength", [1.0, 2.0])
-def test_only_a_curve_that_a_relay_confirms_is_kept(
+def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strength: float
 ) -> None:
     """The pump is as strong as this, and so is the map; another time the map says twice as much."""
@@ -180,7 +180,7 @@ def test_only_a_curve_that_a_relay_confirms_is_kept(
         assert done.before == before[1]
         assert rig.pump == wrong
     else:
-        with pytest.raises(RejectedError, match=r"relay contradicts the curve .* run `tune pump` again"):
+        with pytest.raises(RejectedError, match=r"steps of the flow contradict the curve .* run `tune pump` again"):
             session.map_pump(folder, rig)
         assert (rig.loop, rig.pump) == before
         assert not session.mapped(folder)

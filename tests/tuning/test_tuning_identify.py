@@ -100,7 +100,9 @@ def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> No
     whole = record(TRUTH, samples=400, laser_um=4.0, walk_um2_per_s=0.5)
     found = judge(whole, identify(whole))
     assert found.verdict == "refused"
-    assert any("tune characterise" in reason or "longer" in reason or "tune pump" in reason for reason in found.reasons)
+    assert any(
+        "tune characterise" in reason or "longer" in reason or "tune pump" in reason for reason in found.reasons
+    )
 
 
 def test_a_pump_that_saturates_is_told_from_a_straight_one() -> None:

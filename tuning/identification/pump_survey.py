@@ -25,7 +25,7 @@ _JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
-_LEAST_S, _VAIN_S = 4.0, 1.0  # of a run: to be of use; nothing but a lost laser ends one as soon
+_LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
@@ -66,7 +66,7 @@ class PumpSurvey:
     limit_um: float = 10.0
     runs: list[PumpRun] = field(default_factory=list)
     fit: PumpFit = field(default_factory=lambda: PumpFit({}, 0.0, 0.0, 0.0, 0.8))
-    in_vain: int = 0  # the latest runs that were over at once
+    dark: int = 0  # the latest runs that ended without a reading
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _rounds: int = 0
     _wanted: set[Level] = field(default_factory=set)
@@ -83,7 +83,7 @@ class PumpSurvey:
         self._share = min(1.0, self._share * (1.2 if completed else 0.8))
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
-        self.in_vain = self.in_vain + 1 if run.fraction.size * run.dt_s < _VAIN_S else 0
+        self.dark = self.dark + 1 if math.isnan(run.displacement_um[-1]) else 0
         if self.runs:
             self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
             self._branches = {rising: self._branch(rising) for rising in (True, False)}
