@@ -348,8 +348,8 @@ def map_pump(
 ) -> tuple[MappedPump, folder.SessionFolder]:
     """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
-    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones that do. Raises RejectedError with
-    what to do if there is no curve, or the steps contradict it; the former curve and gains are then in force.
+    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones that
+    do. Raises RejectedError with what to do if there is no curve, or the steps contradict it; the former curve and gains are then in force.
     """
     before = rig.pump
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
@@ -357,7 +357,7 @@ def map_pump(
         found = _surveyed(rig, limit_um)
         found = replace(found, pump=found.pump.model_copy(update={"probe_um": before.probe_um}))
         loop = _safe(rig.good[0], found)
-        rig.set_gains(loop, "the measured curve of the pump", _MAP_S, found.pump)
+        rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
         gain, sigma = _checked(rig)
     except (characterise.ExperimentError, ValueError) as error:
         rig.go_back()

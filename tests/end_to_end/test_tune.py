@@ -80,7 +80,7 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     assert 12.0 <= record.duration_s < 24.0
     assert record.lost_fraction < 0.3  # a machine that pauses twice skips ticks; they are counted, not hidden
     curve = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 5.3), flow_full_um_per_s=5.3)
-    rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0, curve)
+    rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0, pump=curve)
     rig.keep()
     link.close()
     again = connected(logs)
