@@ -348,8 +348,9 @@ def map_pump(
 ) -> tuple[MappedPump, folder.SessionFolder]:
     """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
-    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones that
-    do. Raises RejectedError with what to do if there is no curve, or the steps contradict it; the former curve and gains are then in force.
+    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones
+    that do. Raises RejectedError with what to do if there is no curve, or the steps contradict it; the former curve
+    and gains are then in force.
     """
     before = rig.pump
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)

@@ -26,7 +26,11 @@ class PortClient:
         self._connection, self._where, self._notice = connection, where, notice
         self._lines = connection.makefile("rb")
         self._number = 0
-        greeting = self._next()
+        try:
+            greeting = self._next()
+        except DeviceError:
+            self.close()
+            raise
         if greeting is None:  # the hold records the reason; with TLS it is usually a refused certificate
             self.close()
             raise DeviceError(f"{where}: no greeting; with TLS, check the certificate")
