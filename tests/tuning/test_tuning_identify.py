@@ -52,7 +52,7 @@ def test_a_short_or_silent_record_is_refused() -> None:
     whole = record(TRUTH)
     with pytest.raises(ValueError, match="too short"):
         identify(whole.part(0.0, 1.0))
-    with pytest.raises(ValueError, match="relay"):
+    with pytest.raises(ValueError, match="tune characterise"):
         identify(replace(whole, flow_um_per_s=np.ones(len(whole))))
 
 
