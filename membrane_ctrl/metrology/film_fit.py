@@ -29,7 +29,7 @@ _ROUND = np.array([2, 9, 20, 35])  # of a figure's 36 parameters: Noll 4, 11, 22
 _FREEDOM = np.array([1.0, 1.0, 1.0, 0.1])  # of a misfit: the excess has a tenth of a term's
 _DIFFERS = 0.1  # of the misfit that differs between the sets, the part that does not follow the sag
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
-_TIMES_SEEN = np.logspace(-1, 2.5, 15)  # sizes of the common misfit, in those of the terms without a law
+_TIMES_SEEN = np.logspace(0, 2.5, 12)  # sizes of the common misfit: never below that of the terms without a law
 _SIZES_MM = np.logspace(-6, -0.5, 10)  # of the other misfit
 # by which the law's misfit is unlike that of the terms without a law: natural logarithm, of a Cauchy distribution
 _UNLIKE = 1.0
