@@ -136,6 +136,16 @@ class ForeignPlant:
     def time_s(self) -> float:
         return self._steps * STEP_S
 
+    weather_s = _WEATHER_S
+
+    def undisturbed_um(self) -> np.ndarray:
+        """The centre's displacement by the weather alone, every 50 ms: the first gas, no pump, no leak."""
+        sag = np.full_like(self._ambient, _SAG_UM)
+        for _ in range(4):
+            total = self._ambient + sag * (_TENSION + _STRETCH * sag**2)
+            sag -= (total * sag - self._gas * self._air) / (total + (_TENSION + 3 * _STRETCH * sag**2) * sag)
+        return sag - _SAG_UM
+
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         self._command, self._vent = pump_fraction, vent_fraction
 
