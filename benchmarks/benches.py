@@ -1,8 +1,8 @@
 """Benches drawn at random in the second world: a hold with defaults, a whole session, a hold with what it kept.
 
 The benches share no physics with the twin (`tests/support/second_world.py`). The session knows of them what a lab
-knows: the rate, and which sensors there are. `python -m benchmarks.benches --benches 200` examines them, one line each
-in `build/benches.jsonl`; a second call goes on where the first one ended, and prints the tables of docs/tuning.md.
+knows: the rate, and which sensors there are. `python -m benchmarks.benches --benches 200` examines them, one line
+each in `build/benches.jsonl`; a second call goes on where the first ended. It prints the tables of docs/tuning.md.
 """
 
 from __future__ import annotations
