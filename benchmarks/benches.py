@@ -181,7 +181,7 @@ def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     found: dict[str, Any] = {"kept": done.kept, "reason": done.reason, "predicted_um": gains.predicted_std_um}
     if not done.kept:
         return found
-    tuned = config.model_copy(update={"loop": done.after, "pump": session.pump_of(folder)})
+    tuned = config.model_copy(update={"loop": done.after, "pump": folder.config.pump})
     return found | _held("tuned", bench, tuned)
 
 
