@@ -182,8 +182,8 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 def _reconstructor(spec: process.AcquisitionSpec, optics: OpticsConfig) -> live.LiveReconstructor:
     """What makes figures of the frames, with their covariance if the uncertainty of the geometry is stated."""
     kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
-    spread, _ = spread_file.spread_of(optics.geometry, kept if kept is not None and kept.exists() else None)
-    return live.LiveReconstructor(optics, spec.config.shape.bin_px, spread=spread if spread.names else None)
+    spread, _ = spread_file.spread_of(optics, kept if kept is not None and kept.exists() else None)
+    return live.LiveReconstructor(optics, spec.config.shape.bin_px, spread=spread)
 
 
 def _twin_bench(

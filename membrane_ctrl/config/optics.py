@@ -10,6 +10,7 @@ from firmware_iface.settings import Micrometres, Section
 
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # of whatever unit: a kilometre of mm
 Vector3 = tuple[Length, Length, Length]
+Sigma = Annotated[float, Field(ge=0, le=1e5)]  # of whatever unit; 0: exact
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
@@ -115,6 +116,54 @@ class CameraPoseConfig(Section):
         return self
 
 
+class SigmasConfig(Section):
+    """Standard uncertainties of what is not calibrated; the defaults are those of rulers and data sheets.
+
+    Those of a, b and alpha are beside them. A calibrated geometry replaces those that its calibration freed.
+    """
+
+    screen_x_mm: Sigma = 1.0
+    """Place of O' along s_x. Set it to that of your measurement."""
+    screen_y_mm: Sigma = 1.0
+    """Place of O' along s_y. Set it to that of your measurement."""
+    screen_turn_x_deg: Sigma = 0.5
+    """Turn of the screen about s_x. Set it to that of your measurement."""
+    screen_turn_y_deg: Sigma = 0.5
+    """Turn of the screen about s_y. Set it to that of your measurement."""
+    screen_turn_z_deg: Sigma = 0.2
+    """Turn of the screen in its plane. Set it to that of your measurement."""
+    camera_yaw_deg: Sigma = 0.1
+    """Turn of the camera to the right. Set it to that of your measurement."""
+    camera_pitch_deg: Sigma = 0.1
+    """Turn of the camera up. Set it to that of your measurement."""
+    camera_roll_deg: Sigma = 0.1
+    """Turn of the camera about its axis. Set it to that of your measurement."""
+    focal_relative: Sigma = 0.01
+    """Focal length, of its value: a data sheet's 1 %. Set it to the lens calibration's."""
+    principal_mm: Sigma = 0.07
+    """Principal point, along rows and along columns. Set it to the lens calibration's."""
+    k1: Sigma = 0.02
+    """Radial distortion with r^2. Set it to the lens calibration's."""
+    k2: Sigma = 0.05
+    """Radial distortion with r^4. Set it to the lens calibration's."""
+    p1: Sigma = 1e-3
+    """Decentring of the lens. Set it to the lens calibration's."""
+    p2: Sigma = 1e-3
+    """Decentring of the lens. Set it to the lens calibration's."""
+    bow_mm: Sigma = 1.5
+    """Bow of the screen, 200 mm from O'. Set it to that of your measurement."""
+    pitch_relative: Sigma = 1e-3
+    """Pixel pitch of the screen, of its value. Set it to that of your measurement."""
+    laser_relative: Sigma = 1e-3
+    """Scale of the laser, of its value. Set it from the laser's data sheet."""
+    glass_mm: Sigma = 1.0
+    """Thickness of the glass in front of the screen's pixels, which bends the rays. Lower it if b includes it."""
+    air_k_per_m: Sigma = 0.5
+    """Vertical gradient of the air's temperature, which bends the rays. Change it to the room's."""
+    temperature_k: Sigma = 2.0
+    """Change of temperature since the distances were measured: steel grows. Change it to the room's."""
+
+
 class GeometryConfig(Section):
     """Camera and screen: the paper's a, b, alpha, or two general poses (docs/interfaces.md).
 
@@ -133,6 +182,7 @@ class GeometryConfig(Section):
     """Standard uncertainty of `b_mm`. Set it to get the error bars of the height."""
     alpha_sigma_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     """Standard uncertainty of `alpha_deg`. Set it to get the error bars of the height."""
+    sigmas: SigmasConfig | None = None
     reference_displacement_um: Micrometres | None = None
     """Displacement when measured; the first frame's when absent. Set it if the mirror stood elsewhere then."""
     camera: CameraPoseConfig | None = None

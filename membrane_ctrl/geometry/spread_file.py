@@ -17,9 +17,17 @@ from pydantic import Field
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.geometry.file import LensTable
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
-from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed, stated_spread
+from membrane_ctrl.metrology.uncertainty.geometry_spread import (
+    OPTIONAL_NAMES,
+    PAPER_SPREAD,
+    POSE_NAMES,
+    GeometrySpread,
+    moved_bench,
+    stated_spread,
+)
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
 
@@ -45,27 +53,36 @@ def read_spread(path: Path) -> GeometrySpread | None:
         raise InputError(f"{path}: covariance.{error}") from None
 
 
-def spread_of(geometry: schema.GeometryConfig, file: Path | None) -> tuple[GeometrySpread, str]:
-    """How well a geometry is known, and the source of that; the first available of:
+def spread_of(optics: schema.OpticsConfig, file: Path | None) -> tuple[GeometrySpread, str]:
+    """How well poses, lens and screen are known, and the source of that.
 
-    the file's covariance, the geometry's own sigmas, the paper's instruments for the short form. A general form
-    without a covariance is taken as exact.
+    The file's covariance, else the geometry's own sigmas of a, b and alpha, else those of the paper's instruments.
+    What these do not name has the sigma of `[geometry.sigmas]`; of the poses, only where no file has a covariance.
 
     Raises InputError if the file's covariance is for the other form.
     """
-    given = None if file is None else read_spread(file)
+    geometry, given = optics.geometry, None if file is None else read_spread(file)
+    others = sigmas_of(optics)
     if given is not None:
         try:
-            changed(geometry, given.names, np.zeros(len(given.names)))
+            moved_bench(optics, given.names, np.zeros(len(given.names)))
         except ValueError as error:
             raise InputError(f"{file}: covariance.names: {error}") from None
-        return given, f"covariance in {file}"
+        optional = {name: sigma for name, sigma in others.items() if name in OPTIONAL_NAMES}
+        return given.with_others(optional), f"covariance in {file}"
     stated = stated_spread(geometry)
     if stated is not None:
-        return stated, "a_sigma_mm, b_sigma_mm, alpha_sigma_deg of the geometry"
-    if geometry.a_mm is not None:
-        return PAPER_SPREAD, "not stated: the paper's 2 mm, 2 mm and 0.3 degrees assumed"
-    return GeometrySpread((), np.zeros((0, 0))), "not stated: poses taken as exact, pixel noise alone"
+        return stated.with_others(others), "a_sigma_mm, b_sigma_mm, alpha_sigma_deg and sigmas of the geometry"
+    says = "not stated: the paper's 2 mm, 2 mm and 0.3 degrees assumed, data sheets for the rest"
+    return PAPER_SPREAD.with_others(others), says
+
+
+def sigmas_of(optics: schema.OpticsConfig) -> dict[str, float]:
+    """`[geometry.sigmas]` by the names of `calibrate`'s parameters, without a, b and alpha."""
+    stated = optics.geometry.sigmas or SigmasConfig()
+    pixels = stated.principal_mm / (optics.camera.pixel_um * 1e-3)
+    known = stated.model_dump() | {"principal_x_px": pixels, "principal_y_px": pixels}
+    return {name: known[name] for name in (*POSE_NAMES[3:], *OPTIONAL_NAMES)}
 
 
 SCHEMA = "membrane-prior/1"

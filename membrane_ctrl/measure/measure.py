@@ -17,8 +17,7 @@ from membrane_ctrl.metrology.optics.surface import RadialProfile, radial_profile
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 
-# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round to about 1 mm.
-_RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
+_NAMED = 4  # inputs that contribute most
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,11 @@ def measure_command(options: MeasureOptions) -> int:
     target = options.out.resolve() if options.out else folder / "result"  # follow a link that the user names
     light, outline = _outline(measurement)
     profile = _profile(measurement)
-    bars = results.error_bars(measurement, geometry)
+    bars = results.error_bars(measurement, geometry, outline)
+    measurement = results.with_doubts(measurement, bars)
     figure = figure_results.measured_figure(measurement, bars, options.nominal_radius_mm)
     block = figure_results.figure_table(measurement, figure, bars) if figure and bars else None
-    result = results.result_table(measurement, block)
+    result = results.result_table(measurement, bars, block)
     details = results.details_table(measurement, profile, outline, bars)
     lines = _lines(measurement, profile, outline, bars) + (
         [] if figure is None else figure_results.figure_lines(figure)
@@ -104,12 +104,16 @@ def _lines(
     if full is None or profile is None or bars is None:
         return lines
     of_noise, of_geometry = bars.sag_um
+    total, rows = bars.budget.total(), bars.budget.rows()
+    largest = ", ".join(f"{row['name']} {row['height_rms_um']:.3g}" for row in rows[:_NAMED])
     residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
-        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um from noise"
-        + (f", {of_geometry:.3g} um from the geometry" if of_geometry > 0 else ""),
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um from noise and the film, "
+        f"{of_geometry:.3g} um from the geometry",
         f"geometry  uncertainty from {bars.source}",
+        f"budget    1 sigma of height {total['height_rms_um']:.3g} um RMS, without its plane "
+        f"{total['figure_rms_um']:.3g} um; largest: {largest}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
         f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
         f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",
@@ -118,10 +122,8 @@ def _lines(
         f"{np.count_nonzero(full.weights)} pixels",
     ]
     if outline is not None:
-        off = abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
         lines.append(
             f"rim       {outline.offset_mm:.1f} mm off the prediction, {outline.size_ratio:.4f} of the predicted size"
-            + (": check the camera's pose and mirror.radius_mm" if off else "")
         )
     return lines
 

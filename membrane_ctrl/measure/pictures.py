@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # half a second to load, and most measurements make no record
 _SHOWN_PX = 600  # side of pixel maps
 _MAP_CELLS = 450
 _STEEP = 3.0  # largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
+_SHOWN_ROWS = 16  # of the budget: the rest adds nothing
 
 
 def draw_all(
@@ -96,12 +97,18 @@ def _figure(found: MeasuredFigure) -> Figure:
 
 
 def _uncertainty(bars: ErrorBars) -> Figure:
-    """Draw 1 sigma from noise and, if known, from the geometry."""
-    figure, (left, right) = sheet(12, 4.8, 1, 2)
+    """Draw 1 sigma from the set itself and from the geometry, and the budget."""
+    figure, (left, middle, right) = sheet(17, 4.8, 1, 3)
     of_noise, of_geometry = bars.maps_um()
-    show_map(left, "1 sigma from pixel noise (nm)", bars.grid.axis_mm, 1e3 * of_noise, "magma")
-    if np.isfinite(of_geometry).any():
-        show_map(right, "1 sigma from the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+    show_map(left, "1 sigma from this set: noise, film, light (um)", bars.grid.axis_mm, of_noise, "magma")
+    show_map(middle, "1 sigma from the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+    rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0][:_SHOWN_ROWS][::-1]
+    places = np.arange(len(rows))
+    right.barh(places + 0.2, [row["height_rms_um"] for row in rows], 0.4, label="height")
+    right.barh(places - 0.2, [row["figure_rms_um"] for row in rows], 0.4, label="figure (without its plane)")
+    right.set_yticks(places, [row["name"] for row in rows], fontsize=8)
+    right.set(xscale="log", xlabel="um RMS", title="budget: contribution of each input, 1 sigma")
+    right.legend(loc="lower right")
     return figure
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +15,13 @@ import numpy as np
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
-from membrane_ctrl.metrology import bins, phase
+from membrane_ctrl.metrology import bins, witnesses
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.metrology.uncertainty.budget import Budget, slope_variance
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
 
@@ -27,19 +29,29 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
 
 
-# Uncertainty of a measured height without trials: both parts are linear (`metrology.uncertainty`), a few dozen
-# solutions of thinned points, 50 ms. The Monte Carlo of the `uncertainty` command agrees within 10 %.
+# Uncertainty of a measured height without trials: every part is linear (`metrology.uncertainty.budget`), some hundred
+# solutions of thinned points. The Monte Carlo of the `uncertainty` command agrees within 10 %.
 
 
 @dataclass(frozen=True)
 class ErrorBars:
-    """Covariances (36, 36) of the fit's parameters, mm^2."""
+    """The budget of a measurement; covariances (36, 36) of the fit's parameters, mm^2."""
 
-    noise: FloatArray  # from pixel noise, or the scatter of the slopes if larger
-    geometry: FloatArray  # from the geometry's covariance; zeros if the poses count as exact
-    source: str  # source of that covariance
+    budget: Budget
+    source: str  # source of the geometry's covariance
+    doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
     grid: monte_carlo.HeightMap  # grid of `maps_um`
     cell_slope: float = 0.0  # 1 sigma of the mean slope of a cell of the height map, from pixel noise
+
+    @property
+    def noise(self) -> FloatArray:
+        """From this set: noise, light, motion, slopes that the fit leaves."""
+        return self.budget.covariance(common=False)
+
+    @property
+    def geometry(self) -> FloatArray:
+        """From what all sets of the bench share: poses, lens, screen."""
+        return self.budget.covariance(common=True)
 
     @property
     def sag_um(self) -> tuple[float, float]:
@@ -54,40 +66,36 @@ class ErrorBars:
         return of_noise, of_geometry
 
 
-def error_bars(measurement: Measurement, geometry: Path | None) -> ErrorBars | None:
+def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline | None) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
-    Raises InputError if the covariance is invalid or for the other form of geometry. `geometry` is the file
-    with the covariance.
+    Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to propagate.
+    `geometry` is the file with the covariance, `outline` the rim in the picture.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:
         return None
-    swing = full.quality.modulation_share * (2**optics.camera.bits - 1)
-    pixel = bins.pixel_sigma_adu(optics.camera.noise_adu)
-    shifts = [checked.stack.shifts_rad(used) for used in checked.view.used]
-    sigma_mm = phase.mm_per_rad(optics.pattern) * np.array([phase.phase_sigma_rad(d, pixel, swing) for d in shifts])
-    gain = bins.slope_per_screen(checked.tracer.geometry, full.surface.radius_mm, full.surface.sag_mm)
-    spread, source = spread_of(optics.geometry, geometry)
+    spread, source = spread_of(optics, geometry)
+    noise_adu = float(np.nanmax([bins.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]))
     try:
-        state = checked.state
-        exact, places_px = np.zeros((2, state.index.size)), checked.places_px(state.index)
-        bench = monte_carlo.TrialBench.of_points(
-            optics, checked.tracer, state.surface, state.points, places_px, exact, monte_carlo.TRIAL_POINTS
-        )
-        of_geometry = monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
+        seen = witnesses.examine(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
-        of_geometry, source = (
-            np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan),
-            f"{source}: too large to propagate",
-        )
+        raise errors.InputError(f"{source}: too wide: the figure does not follow from such a geometry") from None
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
-    variance = gain @ sigma_mm**2
+    variance = slope_variance(optics, full, [checked.stack.shifts_rad(used) for used in checked.view.used], noise_adu)
     cell_slope = math.sqrt(float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0])))
-    return ErrorBars(bins.parameter_covariance(full.fit, variance), of_geometry, source, grid, cell_slope)
+    return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope)
 
 
-def result_table(measurement: Measurement, figure: dict[str, Any] | None) -> dict[str, Any]:
+def with_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
+    """The measurement with the verdict that its error bars allow: a doubt degrades an `ok`."""
+    if bars is None or not bars.doubts or measurement.verdict == "rejected":
+        return measurement
+    known = [measurement.reason] if measurement.reason else []
+    return replace(measurement, verdict="degraded", reason="; ".join([*known, *bars.doubts]))
+
+
+def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[str, Any] | None) -> dict[str, Any]:
     """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null.
 
     `figure` is its block of that name (`figure_results.figure_table`).
@@ -115,6 +123,8 @@ def result_table(measurement: Measurement, figure: dict[str, Any] | None) -> dic
         },
         "fit": _fit_table(full),
         "quality": quality,
+        "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},
+        "budget": [] if bars is None else bars.budget.rows(),
         "geometry": measurement.head.geometry.table(),
         "timing_s": measurement.timing_s,
         "figure": figure,
@@ -186,7 +196,8 @@ def write_result(
         if bars is not None:
             axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
             file = out / "sigma.npz"
-            write_arrays(file, x_mm=axis, y_mm=axis, sigma_noise_um=of_noise, sigma_geometry_um=of_geometry)
+            maps = {"sigma_noise_um": of_noise, "sigma_geometry_um": of_geometry}
+            write_arrays(file, x_mm=axis, y_mm=axis, sigma_um=np.hypot(of_noise, of_geometry), **maps)
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:

@@ -208,7 +208,7 @@ class StabilityRun:
 
     def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
         if self._spread is None:
-            self._spread, self._source = spread_of(one.head.optics.geometry, self._geometry)
+            self._spread, self._source = spread_of(one.head.optics, self._geometry)
             self._origin = one.head.geometry.table()
         return self._spread
 

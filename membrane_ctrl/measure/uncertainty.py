@@ -114,7 +114,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     """Run the trials, write map, table and picture, and report. Raises CommandError."""
     figures = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
     sets = [figures.of(folder) for folder in (options.folder, options.against) if folder is not None]
-    spread, source = spread_file.spread_of(sets[0].head.optics.geometry, options.geometry)
+    spread, source = spread_file.spread_of(sets[0].head.optics, options.geometry)
     print(f"geometry uncertainty: {source}", file=sys.stderr)
     benches = [one.bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:

@@ -51,7 +51,7 @@ class LiveReconstructor:
     shifts_rad : (N,) or (2, N) array, optional
         Phase steps, of x and y if they differ; equal ones if not given.
     spread : GeometrySpread, optional
-        How well the geometry is known; with it each full cycle computes `geometry_covariance_um2`.
+        How well the geometry is known; with it the first full cycle computes `geometry_covariance_um2`.
 
     Raises
     ------
@@ -120,7 +120,7 @@ class LiveReconstructor:
             state = motion.establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
-        if self._spread is not None:
+        if self._spread is not None and not np.isfinite(self._geometry_covariance_mm2).all():
             self._geometry_covariance_mm2 = self._from_geometry(self._spread, tracer, state)
         return self._follow("full", state, times, readings)
 

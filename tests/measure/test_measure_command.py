@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.config.optics import SigmasConfig
 
 SMALL = ["--shrink", "8"]
 
@@ -350,6 +351,7 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert measured(made / "0000", tmp_path)[0] == 0
     said = capsys.readouterr().out
     assert "from noise" in said
+    assert "largest: principal_x_px" in said
     assert "the paper's 2 mm, 2 mm and 0.3 degrees assumed" in said
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")
@@ -369,6 +371,7 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: Path) -> None:
     geometry = tomllib.loads((made / "0000" / "capture.toml").read_text())["geometry"]
     covariance = {"names": ["a_mm"], "matrix": [[1e-8]]}
+    geometry["sigmas"] = dict.fromkeys(SigmasConfig().model_dump(), 0.0)
     (tmp_path / "g.toml").write_text(tomli_w.dumps({"geometry": geometry, "covariance": covariance}))
     assert measured(made / "0000", tmp_path / "out", "--geometry", str(tmp_path / "g.toml"))[0] == 0
     details = json.loads((tmp_path / "out" / "details.json").read_text())["sag_sigma_um"]

@@ -65,7 +65,11 @@ def test_a_stated_bow_and_map_are_kept() -> None:
 
 def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
     covariance = general_covariance(solution)
-    spread = GeometrySpread(GENERAL_NAMES, covariance)  # refuses what is no covariance
+    freed = ("k1", "bow_mm", "pitch_relative")
+    whole = GeometrySpread((*GENERAL_NAMES, *freed), covariance)  # refuses what is no covariance
+    own = [NAMES.index(name) for name in freed]
+    assert whole.covariance[12:, 12:] == pytest.approx(solution.covariance[np.ix_(own, own)], rel=1e-9)
+    spread = GeometrySpread(GENERAL_NAMES, covariance[:12, :12])
     # a change along one parameter, and the poses' own change by the twelve numbers that stand for it
     config = GeometryConfig.model_validate(tables_of(solution, OPTICS, ORIGIN)["geometry"])
     rng = np.random.default_rng(0)

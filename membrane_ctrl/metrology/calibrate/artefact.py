@@ -1,10 +1,11 @@
 """A calibrated geometry as tables for `geometry.toml`, and back.
 
-`[geometry]` is what every command reads. `[covariance]` is what a Monte Carlo draws from: shifts and turns of camera
-and screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of everything
-about z, has no variance: it defines x). `[parameters]` are the calibration's own, `[calibration]` states the origin
-of all that. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
-screen's pitch were calibrated; a measurement with such a file needs them too.
+`[geometry]` is what every command reads. `[covariance]` is what error bars and a Monte Carlo use: shifts and turns of
+camera and screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of
+everything about z, has no variance: it defines x), and the parameters of lens, bow and pitch that were free.
+`[parameters]` are the calibration's own, `[calibration]` states the origin of all that. The screen's bow is in
+`[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the screen's pitch were calibrated; a
+measurement with such a file needs them too.
 """
 
 from dataclasses import dataclass
@@ -43,7 +44,10 @@ def tables_of(solution: solve.Solution, optics: OpticsConfig, origin: Origin) ->
     tables: dict[str, Any] = {
         "schema": SCHEMA,
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
-        "covariance": {"names": list(GENERAL_NAMES), "matrix": general_covariance(solution).tolist()},
+        "covariance": {
+            "names": [*GENERAL_NAMES, *_optional(solution)],
+            "matrix": general_covariance(solution).tolist(),
+        },
         "parameters": {
             "names": [parameters.NAMES[k] for k in free],
             "values": solution.values[free].tolist(),
@@ -99,7 +103,7 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
 
 
 def general_covariance(solution: solve.Solution) -> FloatArray:
-    """Covariance (12, 12) of `GENERAL_NAMES`.
+    """Covariance (12 + k, 12 + k) of `GENERAL_NAMES` and of the k free parameters of lens, bow and pitch.
 
     Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product matrix of w.
     """
@@ -108,9 +112,17 @@ def general_covariance(solution: solve.Solution) -> FloatArray:
     for turn in parameters.pose_derivatives(solution.problem.stated, solution.values):
         turns = _turn_vector(geometry.rotation.T @ turn.camera), _turn_vector(geometry.screen_axes.T @ turn.screen)
         columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
-    matrix = np.stack(columns, axis=1)
-    covariance = matrix @ solution.covariance[: len(parameters.POSE), : len(parameters.POSE)] @ matrix.T
+    poses = np.stack(columns, axis=1)
+    optional = [parameters.NAMES.index(name) for name in _optional(solution)]
+    used = [*range(len(parameters.POSE)), *optional]
+    matrix = np.eye(len(poses) + len(optional), len(used), k=len(parameters.POSE) - len(poses))
+    matrix[: len(poses), : len(parameters.POSE)] = poses
+    covariance = matrix @ solution.covariance[np.ix_(used, used)] @ matrix.T
     return np.asarray((covariance + covariance.T) / 2)
+
+
+def _optional(solution: solve.Solution) -> list[str]:
+    return [parameter.name for parameter in parameters.OPTIONAL if parameter.name in solution.free]
 
 
 def _turn_vector(cross: FloatArray) -> FloatArray:

@@ -18,10 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
+# a, b and alpha: the paper's; the principal point: of the paper's camera
+_BY_HAND = {"a_mm": 2.0, "b_mm": 2.0, "alpha_deg": 0.3, "principal_x_px": 20.0, "principal_y_px": 20.0}
+_BY_HAND |= SigmasConfig().model_dump()
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
 
@@ -30,8 +34,12 @@ class Parameter:
     """One number that may be wrong."""
 
     name: str  # ends in the unit
-    sigma: float  # its hand measurement, in that unit: ruler, laser meter, protractor, data sheet
     says: str  # for a person
+
+    @property
+    def sigma(self) -> float:
+        """Of its hand measurement, in that unit: ruler, laser meter, protractor, data sheet."""
+        return _BY_HAND[self.name]
 
     @property
     def unit(self) -> str:
@@ -41,30 +49,30 @@ class Parameter:
 
 
 POSE = (
-    Parameter("a_mm", 2.0, "distance of the camera from the vertex"),
-    Parameter("b_mm", 2.0, "distance of the screen from the vertex"),
-    Parameter("alpha_deg", 0.3, "elevation of camera and screen"),
-    Parameter("screen_x_mm", 1.0, "shift of the screen along s_x"),
-    Parameter("screen_y_mm", 1.0, "shift of the screen along s_y"),
-    Parameter("screen_turn_x_deg", 0.5, "turn of the screen about s_x"),
-    Parameter("screen_turn_y_deg", 0.5, "turn of the screen about s_y"),
-    Parameter("screen_turn_z_deg", 0.2, "turn of the screen in its plane"),
-    Parameter("camera_yaw_deg", 0.1, "turn of the camera to the right"),
-    Parameter("camera_pitch_deg", 0.1, "turn of the camera up"),
-    Parameter("camera_roll_deg", 0.1, "turn of the camera about its axis"),
+    Parameter("a_mm", "distance of the camera from the vertex"),
+    Parameter("b_mm", "distance of the screen from the vertex"),
+    Parameter("alpha_deg", "elevation of camera and screen"),
+    Parameter("screen_x_mm", "shift of the screen along s_x"),
+    Parameter("screen_y_mm", "shift of the screen along s_y"),
+    Parameter("screen_turn_x_deg", "turn of the screen about s_x"),
+    Parameter("screen_turn_y_deg", "turn of the screen about s_y"),
+    Parameter("screen_turn_z_deg", "turn of the screen in its plane"),
+    Parameter("camera_yaw_deg", "turn of the camera to the right"),
+    Parameter("camera_pitch_deg", "turn of the camera up"),
+    Parameter("camera_roll_deg", "turn of the camera about its axis"),
 )
 OPTIONAL = (
-    Parameter("focal_relative", 2e-3, "focal length, natural logarithm"),
-    Parameter("principal_x_px", 10.0, "principal point, column"),
-    Parameter("principal_y_px", 10.0, "principal point, row"),
-    Parameter("k1", 0.02, "radial lens distortion, r^2"),
-    Parameter("k2", 0.05, "radial lens distortion, r^4"),
-    Parameter("p1", 1e-3, "decentring of the lens"),
-    Parameter("p2", 1e-3, "decentring of the lens"),
-    Parameter("bow_mm", 1.5, "bow of the screen, 200 mm from its middle, towards the mirror"),
-    Parameter("pitch_relative", 1e-3, "pixel pitch of the screen, relative"),
+    Parameter("focal_relative", "focal length, natural logarithm"),
+    Parameter("principal_x_px", "principal point, column"),
+    Parameter("principal_y_px", "principal point, row"),
+    Parameter("k1", "radial lens distortion, r^2"),
+    Parameter("k2", "radial lens distortion, r^4"),
+    Parameter("p1", "decentring of the lens"),
+    Parameter("p2", "decentring of the lens"),
+    Parameter("bow_mm", "bow of the screen, 200 mm from its middle, towards the mirror"),
+    Parameter("pitch_relative", "pixel pitch of the screen, relative"),
 )
-LASER = Parameter("laser_relative", 1e-3, "scale of the laser, relative")
+LASER = Parameter("laser_relative", "scale of the laser, relative")
 ALL = (*POSE, *OPTIONAL, LASER)
 NAMES = tuple(parameter.name for parameter in ALL)
 OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the laser's scale comes after them

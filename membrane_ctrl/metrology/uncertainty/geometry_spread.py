@@ -1,7 +1,8 @@
 """How well a geometry is known: a covariance over named changes of it, from which trials draw.
 
-The short form changes in a, b and alpha. The general form changes in twelve numbers: camera and screen are each
-shifted (mm, in world) and turned (rad, a rotation vector in world, about the pinhole and about O').
+The poses change in eleven numbers, a, b, alpha and the others of `calibrate.parameters.POSE`, or in the twelve of a
+calibrated geometry: camera and screen are each shifted (mm, in world) and turned (rad, a rotation vector in world,
+about the pinhole and about O'). Lens, bow and pitch change in those of `calibrate.parameters.OPTIONAL`.
 """
 
 from dataclasses import dataclass
@@ -9,10 +10,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, Vector3
+from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
+from membrane_ctrl.metrology.calibrate import parameters
+from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
-SHORT_NAMES = ("a_mm", "b_mm", "alpha_deg")
+POSE_NAMES = tuple(parameter.name for parameter in parameters.POSE)
+OPTIONAL_NAMES = tuple(parameter.name for parameter in parameters.OPTIONAL)  # lens, bow, pitch
+SHORT_NAMES = POSE_NAMES[:3]
 GENERAL_NAMES = tuple(
     f"{thing}_{move}_{axis}_{unit}"
     for thing in ("camera", "screen")
@@ -28,14 +33,18 @@ class GeometrySpread:
     Raises ValueError on construction, for unknown or mixed names and for a matrix that is no covariance.
     """
 
-    names: tuple[str, ...]  # of `SHORT_NAMES` or of `GENERAL_NAMES`; numbers not named are exact
+    names: tuple[str, ...]  # of `calibrate.parameters`, the poses' or `GENERAL_NAMES`; numbers not named are exact
     covariance: FloatArray  # (k, k): of their changes, in the units of the names
 
     def __post_init__(self) -> None:
         if len(set(self.names)) != len(self.names):
             raise ValueError("names: one occurs twice")
-        if not (set(self.names) <= set(SHORT_NAMES) or set(self.names) <= set(GENERAL_NAMES)):
-            raise ValueError(f"names: all from {', '.join(SHORT_NAMES)} or all from {', '.join(GENERAL_NAMES)}")
+        poses = set(self.names) - set(OPTIONAL_NAMES)
+        if not (poses <= set(POSE_NAMES) or poses <= set(GENERAL_NAMES)):
+            raise ValueError(
+                f"names: poses all from {', '.join(POSE_NAMES)} or all from {', '.join(GENERAL_NAMES)}, "
+                f"the rest from {', '.join(OPTIONAL_NAMES)}"
+            )
         if self.covariance.shape != (len(self.names), len(self.names)):
             raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
         if not np.all(np.isfinite(self.covariance)) or not np.allclose(self.covariance, self.covariance.T):
@@ -50,6 +59,14 @@ class GeometrySpread:
     def independent(cls, sigmas: dict[str, float]) -> "GeometrySpread":
         """From one sigma a name."""
         return cls(tuple(sigmas), np.diag(np.square(np.array(list(sigmas.values()), float))))
+
+    def with_others(self, sigmas: dict[str, float]) -> "GeometrySpread":
+        """Independent numbers added to these; those already named stay."""
+        other = GeometrySpread.independent({n: s for n, s in sigmas.items() if n not in self.names and s > 0})
+        size = len(self.names)
+        whole = np.zeros((size + len(other.names), size + len(other.names)))
+        whole[:size, :size], whole[size:, size:] = self.covariance, other.covariance
+        return GeometrySpread(self.names + other.names, whole)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -104,6 +121,18 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
         }
     )
     return geometry.model_copy(update={"camera": moved_camera, "screen": moved_screen})
+
+
+def moved_bench(optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike) -> parameters.BenchGeometry:
+    """The bench with its poses, lens, bow and pitch changed by (k,) amounts.
+
+    Raises ValueError if the names belong to another form of geometry.
+    """
+    amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
+    general = tuple(name for name in names if name in GENERAL_NAMES)
+    geometry = changed(optics.geometry, general, [amounts.pop(name) for name in general])
+    values = np.array([amounts.get(name, 0.0) for name in parameters.NAMES])
+    return parameters.bench_at(Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values)
 
 
 def _turn(amounts: dict[str, float], thing: str) -> FloatArray:

@@ -17,12 +17,13 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, reconstruct
+from membrane_ctrl.metrology.calibrate.parameters import BenchGeometry
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import film_law, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
-from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, changed
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, moved_bench
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
 # 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a millisecond
 TRIAL_POINTS = 6000
@@ -37,6 +38,7 @@ class TrialBench:
     column_px: FloatArray  # (n,): the points in the picture
     row_px: FloatArray  # (n,)
     screen_mm: FloatArray  # (2, n): where the fitted surface sends them
+    residual_mm: FloatArray  # (2, n): where they were seen, less that
     sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
     t_mm: FloatArray  # (n,): lengths of their rays
     surface: Surface
@@ -68,37 +70,48 @@ class TrialBench:
         thinning = points.t_mm.size / np.count_nonzero(chosen)
         points = points.subset(chosen)
         column_px, row_px = place_px[:, chosen]
+        predicted_mm = tracer.predict_screen(points, surface)
         return cls(
             optics=optics,
             vertex_z_mm=tracer.vertex_z_mm,
             column_px=column_px,
             row_px=row_px,
-            screen_mm=tracer.predict_screen(points, surface),
+            screen_mm=predicted_mm,
+            residual_mm=points.screen_mm - predicted_mm,
             sigma_mm=sigma_mm[:, chosen] / np.sqrt(thinning),
             t_mm=points.t_mm,
             surface=surface,
             normal=tracer.normal_matrix(points),
         )
 
-    def solve(self, geometry: Geometry, disturbance_mm: FloatArray | float = 0.0) -> FloatArray:
-        """Parameters (36,) in mm of the surface under a geometry, the screen points (2, n) off by a disturbance.
+    def solve(
+        self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
+    ) -> FloatArray:
+        """Parameters (36,) in mm of the surface on another bench, the screen points (2, n) off by a disturbance.
+
+        One step suffices for a `linear` answer: the next would change it by 1/300.
 
         Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal one.
         """
+        geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
         tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
-        points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), self.screen_mm + disturbance_mm)
+        points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
+        steps = 1 if linear else reconstruct.MAX_ITERATIONS
         with np.errstate(over="ignore", invalid="ignore"):  # of a fit that diverges, which is reported below
-            fit = reconstruct.solve(tracer, points, self.surface, normal=self.normal)
-        if not fit.converged:
+            try:  # the nominal points' matrix would not do: a turn of the camera moves them by centimetres
+                normal = tracer.normal_matrix(points)
+                fit = reconstruct.solve(tracer, points, self.surface, normal=normal, max_iterations=steps)
+            except ValueError:
+                fit = None
+        if fit is None or not (fit.converged or (linear and np.isfinite(fit.changes_mm[-1]))):
             raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
         return fit.surface.parameters
 
-    def geometry(self, names: tuple[str, ...], change: FloatArray) -> Geometry:
-        """The nominal geometry changed."""
-        moved = {"geometry": changed(self.optics.geometry, names, change)}
-        return Geometry.from_config(self.optics.model_copy(update=moved))
+    def geometry(self, names: tuple[str, ...] = (), change: ArrayLike = ()) -> BenchGeometry:
+        """The nominal bench, or changed."""
+        return moved_bench(self.optics, names, change)
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
@@ -201,7 +214,7 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
             continue
         step = np.zeros(len(spread.names))
         step[k] = sigma
-        ends = [bench.solve(bench.geometry(spread.names, sign * step)) for sign in (1.0, -1.0)]
+        ends = [bench.solve(bench.geometry(spread.names, sign * step), linear=True) for sign in (1.0, -1.0)]
         columns.append((ends[0] - ends[1]) / (2 * sigma))
     return np.stack(columns, axis=1) if columns else np.zeros((PARAMETERS, 0))
 

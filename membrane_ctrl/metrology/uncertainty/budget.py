@@ -1,0 +1,237 @@
+"""The budget of a figure's uncertainty: what each input contributes (JCGM 100, clause 5).
+
+An input with the standard uncertainty u changes the figure's 36 parameters by c u, with c its sensitivity: one
+solution of the thinned points with the input off by u. Inputs of type B (data sheets, rulers) are known before the
+measurement; those of type A are seen in the set itself. Inputs that all sets of a bench share cancel in a change
+between two sets.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
+from membrane_ctrl.metrology import bins, motion, phase
+from membrane_ctrl.metrology.calibrate import parameters, propagate, residuals
+from membrane_ctrl.metrology.full import FullResult
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread
+from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
+from membrane_ctrl.model.arrays import FloatArray
+
+_GLASS_INDEX = 1.5
+_STEEL_PER_K = 12e-6
+_AIR_PER_MM = 1e-9  # curvature of a ray across a gradient of 1 K/m
+LIGHT = 5e-4  # of a frame's level or swing, after the correction or below what it can see
+_PATCHES = 40  # across the mirror: slopes that the fit leaves are independent from one to the next
+
+
+@dataclass(frozen=True)
+class Source:
+    """One input, or inputs that are correlated."""
+
+    name: str  # ends in the unit of `sigma`
+    says: str
+    sigma: float  # standard uncertainty of the input; NaN for several at once
+    covariance_mm2: FloatArray  # (36, 36): of the parameters, from this input
+    common: bool = True  # whether all sets of a bench share it: it cancels in a change
+
+
+@dataclass(frozen=True)
+class Budget:
+    """All inputs of one figure."""
+
+    sources: tuple[Source, ...]
+    disc: float  # analysis radius over the radius of the terms
+
+    def covariance(self, common: bool) -> FloatArray:
+        """(36, 36) in mm^2 of the parameters, from what all sets of the bench share or from this set's own."""
+        parts = [source.covariance_mm2 for source in self.sources if source.common == common]
+        return np.asarray(np.sum([np.zeros((PARAMETERS, PARAMETERS)), *parts], axis=0))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Per input, the largest contribution first: its own uncertainty, 1 sigma of sag, height and figure."""
+        rows: list[dict[str, Any]] = []
+        for one in self.sources:
+            sigma = one.sigma if math.isfinite(one.sigma) else None
+            about = {"name": one.name, "says": one.says, "sigma": sigma, "common": one.common}
+            rows.append(about | self.sizes(one.covariance_mm2))
+        return sorted(rows, key=lambda row: -float(row["height_rms_um"]))
+
+    def total(self) -> dict[str, Any]:
+        """1 sigma of sag, height, figure and of the 36 coefficients."""
+        whole = self.covariance(True) + self.covariance(False)
+        to_coeffs = parameter_to_coeffs()
+        coeffs = 1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ whole @ to_coeffs.T), 0.0))
+        return self.sizes(whole) | {"coeffs_um": coeffs.tolist()}
+
+    def sizes(self, covariance_mm2: FloatArray) -> dict[str, float]:
+        """1 sigma of the sag, and over the disc of the height and of the figure (the height without its plane)."""
+        heights, plane = propagate.disc(self.disc)
+        gradient = sag_gradient()
+        sizes = {"sag_um": math.sqrt(max(float(gradient @ covariance_mm2 @ gradient), 0.0))}
+        for name, basis in (("height_rms_um", heights), ("figure_rms_um", propagate.without_plane(heights, plane))):
+            sizes[name] = math.sqrt(max(float(np.sum((basis @ covariance_mm2) * basis)) / len(basis), 0.0))
+        return {name: 1e3 * size for name, size in sizes.items()}
+
+
+def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float = 1.0) -> Iterator[Source]:
+    """Poses, lens and screen; those that are correlated are one source. `widened` multiplies every sigma."""
+    jacobian = widened * monte_carlo.geometry_jacobian(bench, spread)
+    linked = np.count_nonzero(spread.covariance, axis=1) > 1
+    says = {parameter.name: parameter.says for parameter in parameters.ALL}
+    if linked.any():
+        names = [name for name, is_linked in zip(spread.names, linked, strict=True) if is_linked]
+        several = "calibrated" if set(names) & set(GENERAL_NAMES) else ", ".join(names)
+        columns = jacobian[:, linked]
+        covariance = columns @ spread.covariance[np.ix_(linked, linked)] @ columns.T
+        yield Source("geometry", f"poses and optics, with their correlations: {several}", math.nan, covariance)
+    for k in np.flatnonzero(~linked):
+        name, sigma = spread.names[k], float(spread.sigmas[k])
+        effect = jacobian[:, k] * sigma
+        yield Source(name, says.get(name, name), widened * sigma, np.outer(effect, effect))
+
+
+def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
+    """What bends the rays or moves the bench beyond its poses."""
+    nominal = bench.geometry()
+    point, onto, leaving = _paths(bench)
+    # tangents of the ray at the screen: in glass sin / n
+    across = nominal.geometry.screen_axes @ leaving
+    inside = across[:2] / np.sqrt(_GLASS_INDEX**2 - np.sum(across[:2] ** 2, axis=0))
+    yield _disturbed(bench, "glass_mm", "glass in front of the screen's pixels", sigmas.glass_mm, -inside)
+    camera = nominal.geometry.pinhole_mm[:, None]
+    path_mm = np.linalg.norm(point - camera, axis=0) + np.linalg.norm(onto - point, axis=0)
+    bent = np.array([[0.0], [1.0], [0.0]]) * _AIR_PER_MM * path_mm**2 / 2
+    yield _disturbed(
+        bench, "air_k_per_m", "vertical temperature gradient of the air", sigmas.air_k_per_m, _on_screen(bench, bent)
+    )
+    grown, values = _STEEL_PER_K * sigmas.temperature_k, np.zeros(len(parameters.NAMES))
+    for name, length in (("a_mm", nominal.geometry.pinhole_mm), ("b_mm", nominal.geometry.screen_origin_mm)):
+        values[parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
+    effect = bench.solve(parameters.bench_at(nominal.geometry, values)) - bench.surface.parameters
+    says = "growth of the frame since its distances were measured"
+    yield Source("temperature_k", says, sigmas.temperature_k, np.outer(effect, effect))
+
+
+def _paths(bench: TrialBench) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points (3, n) on the film and on the screen, and unit vectors from the one to the other."""
+    geometry = bench.geometry().geometry
+    point = geometry.pinhole_mm[:, None] + bench.t_mm * geometry.rays(bench.column_px, bench.row_px)
+    onto = geometry.screen_points(bench.screen_mm)
+    return point, onto, (onto - point) / np.linalg.norm(onto - point, axis=0)
+
+
+def _on_screen(bench: TrialBench, shift: FloatArray) -> FloatArray:
+    """Change (2, n) of the screen points when the rays arrive shifted by (3, n)."""
+    axes, leaving = bench.geometry().geometry.screen_axes, _paths(bench)[2]
+    return np.asarray(axes[:2] @ (shift - leaving * (axes[2] @ shift) / (axes[2] @ leaving)))
+
+
+def _disturbed(
+    bench: TrialBench, name: str, says: str, sigma: float, per_unit_mm: FloatArray, common: bool = True
+) -> Source:
+    """A source that moves the screen points by (2, n) mm per unit of the input."""
+    effect = bench.solve(bench.geometry(), sigma * per_unit_mm, linear=True) - bench.surface.parameters
+    return Source(name, says, sigma, np.outer(effect, effect), common)
+
+
+def film_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
+    """The film moved by this much from the x frames to the y frames, unknown to the phases."""
+    return _disturbed(bench, "film_um", says, sigma_um, moves_mm(bench) * np.array([[0.5], [-0.5]]), common=False)
+
+
+def moves_mm(bench: TrialBench) -> FloatArray:
+    """Change (2, n) of the screen points per um of the film's displacement."""
+    tracer, points = _stand(bench, bench.geometry().geometry)
+    return motion.sensitivity_mm_per_um(tracer, points, bench.surface)
+
+
+def predicted_mm(bench: TrialBench, there: parameters.BenchGeometry, surface: Surface) -> FloatArray:
+    """Where (2, n) a surface on another bench sends the rays of the points."""
+    tracer, points = _stand(bench, there.geometry)
+    tracer.intersect(points, surface, newton=3)
+    return tracer.predict_screen(points, surface) / there.pitch
+
+
+def _stand(bench: TrialBench, geometry: Geometry) -> tuple[Tracer, Points]:
+    points = Points.of(geometry.rays(bench.column_px, bench.row_px), bench.screen_mm)
+    points.t_mm[:] = bench.t_mm
+    return Tracer(geometry, bench.surface.radius_mm, bench.vertex_z_mm), points
+
+
+def blur_source(bench: TrialBench, sigma_px: float) -> Source:
+    """A picture blurred by a Gauss of this width: the phase is its mean over the blur.
+
+    The mean of the four values at a distance of sqrt(2) sigma, less the value at the centre (`bins.BinGrid`).
+    """
+    nominal, far = bench.geometry(), math.sqrt(2) * sigma_px
+    mean = np.zeros_like(bench.screen_mm)
+    for right, down in ((far, 0.0), (-far, 0.0), (0.0, far), (0.0, -far)):
+        beside = replace(bench, column_px=bench.column_px + right, row_px=bench.row_px + down)
+        mean += predicted_mm(beside, nominal, bench.surface) / 4
+    effect = bench.solve(bench.geometry(), mean - bench.screen_mm, linear=True) - bench.surface.parameters
+    return Source("blur_px", "blur of the picture", sigma_px, np.outer(effect, effect))
+
+
+def light_source(bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray]) -> Source:
+    """The light of each frame is known to `LIGHT` only."""
+    scale, covariance = phase.mm_per_rad(optics.pattern), np.zeros((PARAMETERS, PARAMETERS))
+    for axis, shifts in enumerate(shifts_rad):
+        angle = bench.screen_mm[axis] / scale + phase.centre_phase_rad(optics.pattern)
+        _, cosine, sine = phase.step_weights(shifts)
+        for k, shift in enumerate(shifts):
+            moves = np.zeros_like(bench.screen_mm)
+            turned = cosine[k] * np.sin(angle) - sine[k] * np.cos(angle)
+            moves[axis] = -scale * turned * (1 + np.cos(angle + shift)) * LIGHT
+            effect = bench.solve(bench.geometry(), moves, linear=True) - bench.surface.parameters
+            covariance += np.outer(effect, effect)
+    return Source("light_relative", "light of each frame", LIGHT, covariance, common=False)
+
+
+def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:
+    """White noise of the pixels; and what the slopes show beyond it, taken as one error per patch of the mirror."""
+    inverse = full.fit.normal.inverse
+    middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
+    noise = inverse @ middle @ inverse
+    yield Source("noise_adu", "noise of the pixels", noise_adu, noise, common=False)
+    left = _left_covariance(full, inverse)
+    share = max(0.0, 1 - float(np.trace(noise)) / max(float(np.trace(left)), 1e-300))
+    says = "slopes that the fit leaves: gamma, light, dust, ripple"
+    yield Source("slope_urad", says, 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y), share * left, False)
+
+
+def _left_covariance(full: FullResult, inverse: FloatArray) -> FloatArray:
+    """Covariance (36, 36) of the parameters if the residual slopes are independent from patch to patch only."""
+    grid, side = full.grid, -(-full.grid.axis_mm.size // _PATCHES)
+    edges = np.arange(0, grid.axis_mm.size, side)
+
+    def summed(cells: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(np.add.reduceat(cells, edges, axis=0), edges, axis=1))
+
+    count = summed(grid.count)
+    seen = count > 0
+    x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
+    radius_mm = full.surface.radius_mm
+    at = [summed(grid.count * place)[seen] / count[seen] / radius_mm for place in (x, y)]
+    _, of_x, of_y = residuals.basis(at[0], at[1])
+    slope_x, slope_y = summed(grid.count * grid.slope_x)[seen], summed(grid.count * grid.slope_y)[seen]
+    pulls = (of_x * slope_x + of_y * slope_y) / radius_mm
+    return np.asarray(inverse @ (pulls @ pulls.T) @ inverse)
+
+
+def slope_variance(
+    optics: OpticsConfig, full: FullResult, shifts_rad: list[FloatArray], noise_adu: float
+) -> FloatArray:
+    """(2,) variance of an x and of a y slope of one pixel."""
+    swing = full.quality.modulation_share * (2**optics.camera.bits - 1)
+    sigma_mm = [phase.mm_per_rad(optics.pattern) * phase.phase_sigma_rad(d, noise_adu, swing) for d in shifts_rad]
+    geometry = Geometry.from_config(optics)
+    gain = bins.slope_per_screen(geometry, full.surface.radius_mm, full.surface.sag_mm)
+    return np.asarray(gain @ np.square(sigma_mm))

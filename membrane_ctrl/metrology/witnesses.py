@@ -1,0 +1,177 @@
+"""What a set itself says of its own errors: blur, a film that moved unseen, a rim that is not where it should be."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
+from membrane_ctrl.metrology import motion
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.full import LASER_NOISE_UM, FullResult
+from membrane_ctrl.metrology.optics.geometry import Outline, project
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
+from membrane_ctrl.model.arrays import FloatArray
+
+# A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round to about 1 mm.
+_RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
+_BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
+_UNSEEN_UM = 1000.0  # of the film's motion without a laser, before the fringes are asked
+_SIGMAS = 4.0  # of the fringes' answer: the film moved
+_STEP_MM = 0.01
+
+
+def blur_px(checked: Checked) -> float:
+    """Width of the blur, a Gauss's sigma in pixels: the contrast falls with the fringes' frequency.
+
+    log(swing / light) = const - sigma^2 |grad phase|^2 / 2, for x and y each with its own constant. A bin of m pixels
+    is itself a blur of (m^2 - 1) / 12.
+    """
+    view, bin_px, index = checked.view, checked.binned.bin_px, checked.state.index
+    slopes, contrasts = [], []
+    for axis in range(2):
+        steep = np.sum(np.square(np.gradient(checked.phase_rad[axis])), axis=0).reshape(-1)[index] / bin_px**2
+        contrast = np.log(view.swing_adu[axis].reshape(-1)[index] / view.light.reshape(-1)[index])
+        known = np.isfinite(steep) & np.isfinite(contrast)
+        slopes.append(steep[known] - steep[known].mean())
+        contrasts.append(contrast[known] - contrast[known].mean())
+    steep, contrast = np.concatenate(slopes), np.concatenate(contrasts)
+    square = -2 * float(steep @ contrast) / max(float(steep @ steep), 1e-300) - (bin_px**2 - 1) / 12
+    return math.sqrt(max(square, 0.0))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Film displacement from the x frames to the y frames, as the fringes show it."""
+
+    moved_um: float
+    sigma_um: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether the film moved."""
+        return abs(self.moved_um) > _SIGMAS * self.sigma_um
+
+    @property
+    def uncertain_um(self) -> float:
+        """Standard uncertainty of the motion that is left in the figure, since it is not taken out."""
+        return math.hypot(self.moved_um, self.sigma_um)
+
+
+def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> Motion:
+    """Ask the fringes whether the film moved between the x and the y frames.
+
+    Slopes in x of one bowl and slopes in y of another do not integrate to a surface. Least squares over the 36
+    parameters, all inputs of the geometry with their prior, and the motion: what they cannot explain, it does.
+    """
+    nominal = bench.geometry()
+    base = budget.predicted_mm(bench, nominal, bench.surface)
+    steps = _STEP_MM * np.eye(PARAMETERS)
+    surfaces = [Surface.from_parameters(bench.surface.parameters + s, bench.surface.radius_mm) for s in steps]
+    fitted = np.stack([(budget.predicted_mm(bench, nominal, s) - base).ravel() for s in surfaces], axis=1)
+    explained = [
+        budget.predicted_mm(bench, bench.geometry((name,), [sigma]), bench.surface) - base
+        for name, sigma in zip(spread.names, spread.sigmas, strict=True)
+    ]
+    explained.append(budget.moves_mm(bench) * np.array([[-0.5], [0.5]]) * _UNSEEN_UM)
+    inputs = np.stack([moved.ravel() for moved in explained], axis=1)
+    inputs = inputs - fitted @ np.linalg.lstsq(fitted, inputs, rcond=None)[0]
+    left = bench.residual_mm.ravel()
+    variance = float(np.mean(left**2))
+    covariance = np.linalg.inv(inputs.T @ inputs / variance + np.eye(inputs.shape[1]))
+    answer = covariance @ (inputs.T @ left) / variance
+    return Motion(_UNSEEN_UM * float(answer[-1]), _UNSEEN_UM * math.sqrt(covariance[-1, -1]))
+
+
+def _rim_failed(outline: Outline) -> bool:
+    """Whether the rim is too far from where the camera's pose puts it."""
+    return abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
+
+
+def rim_widening(bench: TrialBench, spread: GeometrySpread, outline: Outline | None) -> float:
+    """By how much the geometry's sigmas are too small for the rim that was seen; at least 1.
+
+    Twice what they allow is nothing to wonder at.
+    """
+    if outline is None:
+        return 1.0
+    theta, radius_mm = np.linspace(0, 2 * np.pi, 60, endpoint=False), bench.surface.radius_mm
+    rim_z_mm = np.full(theta.size, bench.vertex_z_mm + bench.surface.sag_mm)
+    rim = np.stack([radius_mm * np.cos(theta), radius_mm * np.sin(theta), rim_z_mm])
+
+    def seen(names: tuple[str, ...], change: FloatArray) -> FloatArray:
+        points = project(bench.geometry(names, change).geometry, rim)
+        middle = points.mean(axis=1)
+        return np.append(middle, np.mean(np.hypot(*(points - middle[:, None]))))
+
+    nominal = seen((), np.zeros(0))
+    off = [seen((n,), np.array([s])) - nominal for n, s in zip(spread.names, spread.sigmas, strict=True)]
+    # correlations are left out: they make the rim better known than its parts, and the scale then too small
+    sigmas = np.sqrt(np.sum(np.square(off), axis=0)) if off else np.zeros(3)
+    place_mm = float(np.hypot(sigmas[0], sigmas[1])) * radius_mm / nominal[2]
+    far = max(
+        abs(outline.offset_mm) / math.hypot(place_mm, _RIM_OFF_MM / 3),
+        abs(outline.size_ratio - 1) / math.hypot(float(sigmas[2] / nominal[2]), _RIM_SIZE / 3),
+    )
+    return max(1.0, far / 2)
+
+
+@dataclass(frozen=True)
+class Examined:
+    """Budget of a figure, and what makes it doubtful."""
+
+    budget: budget.Budget
+    doubts: tuple[str, ...]
+
+
+def examine(
+    optics: OpticsConfig,
+    checked: Checked,
+    full: FullResult,
+    spread: GeometrySpread,
+    noise_adu: float,
+    outline: Outline | None,
+) -> Examined:
+    """The budget, widened by what the set says of itself. Raises ArithmeticError if the spread is too wide."""
+    state, shifts = checked.state, [checked.stack.shifts_rad(used) for used in checked.view.used]
+    exact, places_px = np.zeros((2, state.index.size)), checked.places_px(state.index)
+    bench = TrialBench.of_points(
+        optics, checked.tracer, state.surface, state.points, places_px, exact, monte_carlo.TRIAL_POINTS
+    )
+    film, doubts = _film(bench, spread, checked)
+    blur = budget.blur_source(bench, blur_px(checked))
+    disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
+    if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
+        doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
+    if outline is not None and _rim_failed(outline):
+        doubts.append(
+            f"the rim is {outline.offset_mm:.1f} mm off the prediction and {outline.size_ratio:.4f} of its size: "
+            "check the camera's pose, the lens and mirror.radius_mm"
+        )
+    sources = [
+        *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
+        *budget.bench_sources(bench, optics.geometry.sigmas or SigmasConfig()),
+        film,
+        blur,
+        budget.light_source(bench, optics, shifts),
+        *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),
+    ]
+    return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
+
+
+def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[budget.Source, list[str]]:
+    """The film's motion between the frames: by the laser, else by the fringes."""
+    readings = checked.stack.readings_um
+    if np.isfinite(readings).all():
+        left = LASER_NOISE_UM if motion.worth_correcting(readings, LASER_NOISE_UM) else float(np.std(readings))
+        sigma_um = math.hypot(left, LASER_NOISE_UM) * math.sqrt(4 / readings.size)
+        return budget.film_source(bench, sigma_um, "motion of the film from x to y that the laser misses"), []
+    moved = unseen_motion(bench, spread)
+    source = budget.film_source(bench, moved.uncertain_um, "motion of the film from x to y, without a laser")
+    if not moved.sure:
+        return source, []
+    says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} um from the x to the y frames"
+    return source, [f"{says}, seen in the fringes: record the laser's readings"]

@@ -1,0 +1,136 @@
+"""The error bars hold the truth: sets with errors unknown to the model, rendered by the twin's ray tracer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
+from membrane_ctrl.metrology.checked import check
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.witnesses import Examined, examine
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.shade import pattern_sequence
+
+SHRINK = 8
+CAMERA = CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
+STATED = OpticsConfig(
+    geometry=GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0), camera=CAMERA
+)
+X, Y = np.meshgrid(*[np.linspace(-475, 475, 41)] * 2)
+INSIDE = np.hypot(X, Y) <= 475
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Errors in um beside what was stated of them."""
+
+    height_um: float
+    sag_um: float
+    examined: Examined
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """1 sigma."""
+        return self.examined.budget.total()
+
+
+def true_bench(**off: float) -> OpticsConfig:
+    """The bench as it really is: the stated one off by these numbers."""
+    there = bench_at(Geometry.from_config(STATED), np.array([off.get(name, 0.0) for name in NAMES]))
+    geometry = there.geometry
+    camera = CameraPoseConfig(
+        position_mm=tuple(geometry.pinhole_mm), rotation=tuple(tuple(row) for row in geometry.rotation)
+    )
+    s_x, s_y = tuple(geometry.screen_s_x), tuple(geometry.screen_s_y)
+    screen = ScreenPoseConfig(
+        origin_mm=tuple(geometry.screen_origin_mm), s_x=s_x, s_y=s_y, bow_mm=off.get("bow_mm", 0.0)
+    )
+    lens = {"focal_mm": geometry.focal_px * CAMERA.pixel_um * 1e-3, "principal_px": geometry.principal_px}
+    return OpticsConfig(
+        geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
+        camera=CAMERA.model_copy(update={**lens, "distortion": geometry.distortion}),
+        pattern=STATED.pattern.model_copy(update={"period_mm": STATED.pattern.period_mm * there.pitch}),
+    )
+
+
+def measured(optics: OpticsConfig, seed: int = 3, blur_px: float = 0.0, y_moved_um: float | None = None) -> Outcome:
+    """A set of a true bench, measured as the stated one. A motion of the film comes without a laser."""
+    film, moved_um = typical_film(37.1, 500.0, seed), y_moved_um or 0.0
+    renderer, shown = OpticsRenderer(optics, film, seed=seed), pattern_sequence("full", STATED.pattern)
+    frames = np.stack([renderer.render(p, moved_um / 2 * (1 if p.axis == "y" else -1)) for p in shown])
+    if blur_px:
+        frames = np.stack([cv2.GaussianBlur(frame, (0, 0), blur_px) for frame in frames])
+    readings: NDArray[np.float64] = np.full(len(shown), np.nan if y_moved_um is not None else 0.0)
+    checked = check(FrameStack(frames, tuple(shown), readings, {}), STATED)
+    full = reconstruct_full(STATED, checked, measure_pixels(STATED, checked))
+    light = checked.binned.means[[k for used in checked.view.used for k in used]].mean(axis=0).astype(float)
+    outline = find_outline(light, checked.tracer.geometry, 500.0, full.surface.sag_mm)
+    error_um = 1e3 * (full.surface.height(X, Y) - film.height_mm(X, Y, 0.0))[INSIDE]
+    rim = np.hypot(X, Y)[INSIDE] > 460
+    examined = examine(STATED, checked, full, spread_of(STATED, None)[0], 0.5, outline)
+    return Outcome(float(np.sqrt(np.mean(error_um**2))), float(error_um[rim].mean()), examined)
+
+
+@pytest.mark.parametrize(
+    ("off", "doubt"),
+    [
+        ({"principal_x_px": 20 / SHRINK}, "the rim is 11"),
+        pytest.param({"camera_yaw_deg": 0.1}, "the rim is 4.8", marks=pytest.mark.campaign),
+        pytest.param({"focal_relative": 0.01}, "1.01", marks=pytest.mark.campaign),
+        pytest.param({"screen_x_mm": 1.0}, "", marks=pytest.mark.campaign),
+        pytest.param({"pitch_relative": 1e-3}, "", marks=pytest.mark.campaign),
+    ],
+    ids=["principal point", "yaw", "focal length", "screen", "pitch"],
+)
+def test_optics_that_are_off(off: dict[str, float], doubt: str) -> None:
+    found = measured(true_bench(**off))
+    assert found.height_um < 2 * found.stated["height_rms_um"]
+    assert abs(found.sag_um) < 2 * found.stated["sag_um"]
+    assert found.height_um > 4  # or this test would say nothing
+    doubts = found.examined.doubts
+    assert bool(doubts) == bool(doubt)
+    assert not doubt or doubt in doubts[0]
+    # the row of the input that was off has the size of the error that it made
+    (row, *_) = [row for row in found.examined.budget.rows() if row["name"] in off]
+    assert found.height_um == pytest.approx(row["height_rms_um"], rel=0.15)
+
+
+def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:
+    """Slopes of two bowls do not integrate: the fringes say how far apart the two are."""
+    found = measured(STATED, y_moved_um=100.0)
+    (doubt,) = found.examined.doubts
+    assert doubt.startswith("the film moved by +")
+    moved_um = float(doubt.split("+")[1].split()[0])
+    assert moved_um == pytest.approx(100, abs=10)
+    own = next(row for row in found.examined.budget.rows() if row["name"] == "film_um")
+    assert found.height_um == pytest.approx(own["height_rms_um"], rel=0.15)
+    assert found.height_um > 15
+
+
+@pytest.mark.campaign
+def test_a_blurred_picture() -> None:
+    found = measured(STATED, blur_px=1.2)
+    (doubt,) = found.examined.doubts
+    assert doubt.startswith("the picture is blurred by 1.2 px")
+    row = next(row for row in found.examined.budget.rows() if row["name"] == "blur_px")
+    assert row["sigma"] == pytest.approx(1.2, abs=0.1)
+    assert found.height_um == pytest.approx(row["height_rms_um"], rel=0.2)
+    assert found.height_um > 1
+
+
+@pytest.mark.campaign
+def test_a_good_set_raises_no_doubt() -> None:
+    found = measured(STATED, seed=5)
+    assert found.examined.doubts == ()
+    own = found.examined.budget.covariance(common=False)
+    assert found.height_um < 2 * found.examined.budget.sizes(own)["height_rms_um"]
