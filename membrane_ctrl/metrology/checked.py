@@ -51,6 +51,7 @@ class Checked:
     tracer: reconstruct.Tracer  # the bench, with the vertex where the laser saw it
     state: motion.TrackedPoints  # the bins' points with their surface
     flags: tuple[integrity.Flag, ...]  # frames that do not belong
+    moved_um: float  # RMS over the used sinusoids: how far the film is from where laser and surface put it
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -175,7 +176,9 @@ def _check(
             _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
             shape = attempt.view.mask.shape
             fitted = (attempt.view, attempt.phase_rad, near.reshape(shape), attempt.tracer, attempt.state)
-            return Checked(stack, binned, *fitted, _merged(flags, known))
+            moved = [seen[k].moved_um for used in attempt.view.used for k in used]
+            moved_um = float(np.sqrt(np.mean(np.square(moved))))
+            return Checked(stack, binned, *fitted, _merged(flags, known), moved_um)
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if pair is not None and pair.swapped_with is not None and not {pair.frame, pair.swapped_with} & set(known):
             order = list(range(len(stack.patterns)))

@@ -20,6 +20,7 @@ from membrane_ctrl.model.arrays import FloatArray
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
 _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
 _UNSEEN_UM = 1000.0  # of the film's motion without a laser, before the fringes are asked
+_UNKNOWN_UM = 20.0  # of the film's place without a laser: a hold, or a mirror left alone for minutes
 _SIGMAS = 4.0  # of the fringes' answer: the film moved
 _STEP_MM = 0.01
 
@@ -141,6 +142,7 @@ def examine(
     bench = TrialBench.of_points(
         optics, checked.tracer, state.surface, state.points, places_px, exact, monte_carlo.TRIAL_POINTS
     )
+    sigmas = optics.geometry.sigmas or SigmasConfig()
     film, doubts = _film(bench, spread, checked)
     blur = budget.blur_source(bench, blur_px(checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
@@ -153,25 +155,42 @@ def examine(
         )
     sources = [
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
-        *budget.bench_sources(bench, optics.geometry.sigmas or SigmasConfig()),
-        film,
+        *budget.bench_sources(bench, sigmas),
+        *film,
+        _vertex(bench, sigmas, checked),
         blur,
-        budget.light_source(bench, optics, shifts),
+        *budget.frame_sources(bench, optics, shifts, _film_um(checked)),
         *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),
     ]
     return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
 
 
-def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[budget.Source, list[str]]:
-    """The film's motion between the frames: by the laser, else by the fringes."""
+def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked) -> budget.Source:
+    """Where the vertex is: by the laser, or nobody knows."""
     readings = checked.stack.readings_um
-    if np.isfinite(readings).all():
-        left = LASER_NOISE_UM if motion.worth_correcting(readings, LASER_NOISE_UM) else float(np.std(readings))
-        sigma_um = math.hypot(left, LASER_NOISE_UM) * math.sqrt(4 / readings.size)
-        return budget.film_source(bench, sigma_um, "motion of the film from x to y that the laser misses"), []
+    if not np.isfinite(readings).all():
+        return budget.vertex_source(bench, _UNKNOWN_UM, "place of the vertex, without a laser")
+    scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
+    sigma_um = math.hypot(LASER_NOISE_UM / math.sqrt(readings.size), scale_um)
+    return budget.vertex_source(bench, sigma_um, "place of the vertex, by the laser's noise and scale")
+
+
+def _film_um(checked: Checked) -> float:
+    """Motion of the film at a frame, 1 sigma, that is left in the phases: what neither laser nor fringes rule out."""
+    readings = checked.stack.readings_um
+    if not np.isfinite(readings).all():
+        return checked.moved_um
+    known = motion.worth_correcting(readings, LASER_NOISE_UM)
+    return math.hypot(LASER_NOISE_UM if known else float(np.std(readings)), checked.moved_um)
+
+
+def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[list[budget.Source], list[str]]:
+    """The film's motion from x to y where no laser tells it: by the fringes."""
+    if np.isfinite(checked.stack.readings_um).all():
+        return [], []
     moved = unseen_motion(bench, spread)
     source = budget.film_source(bench, moved.uncertain_um, "motion of the film from x to y, without a laser")
     if not moved.sure:
-        return source, []
+        return [source], []
     says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} um from the x to the y frames"
-    return source, [f"{says}, seen in the fringes: record the laser's readings"]
+    return [source], [f"{says}, seen in the fringes: record the laser's readings"]

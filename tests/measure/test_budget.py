@@ -112,7 +112,7 @@ def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:
     assert doubt.startswith("the film moved by +")
     moved_um = float(doubt.split("+")[1].split()[0])
     assert moved_um == pytest.approx(100, abs=10)
-    own = next(row for row in found.examined.budget.rows() if row["name"] == "film_um")
+    own = next(row for row in found.examined.budget.rows() if row["name"] == "film_x_to_y_um")
     assert found.height_um == pytest.approx(own["height_rms_um"], rel=0.15)
     assert found.height_um > 15
 

@@ -16,6 +16,7 @@ import tomli_w
 from rerun.chunk import RrdReader
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.config.optics import SigmasConfig
 
 pytestmark = pytest.mark.usefixtures("undrawn")  # but for `result`, which is made before
 SETS, INTERVAL_S, DRIFT_UM_PER_S = 13, 60.0, 0.02
@@ -131,6 +132,7 @@ def test_a_geometry_of_its_own(spoiled: Path, tmp_path: Path, capsys: pytest.Cap
     path = tmp_path / "geometry.toml"
     geometry = tomllib.loads((spoiled / "0000" / "capture.toml").read_text())["geometry"]
     covariance = {"names": ["a_mm"], "matrix": [[0.25]]}
+    geometry["sigmas"] = dict.fromkeys(SigmasConfig().model_dump(), 0.0)
     path.write_text(tomli_w.dumps({"geometry": {**geometry, "a_mm": 2680.0}, "covariance": covariance}))
     _, own = analysed(spoiled, tmp_path / "own")
     code, table = analysed(spoiled, tmp_path / "out", "--geometry", str(path))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.config.optics import SigmasConfig
 
 FEW = ("--trials", "40")
 POSES = """
@@ -28,6 +29,8 @@ s_x = [-0.98741, 0.0, -0.15816]
 s_y = [0.0, 1.0, 0.0]
 """
 SHORT = "[geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
+
+EXACT = "[geometry.sigmas]\n" + "".join(f"{name} = 0.0\n" for name in SigmasConfig().model_dump())  # but a, b, alpha
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def test_a_set(analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: 
     assert json.loads(said.out) == table
     assert "assumed" in said.err  # the set does not state its sigmas
     assert table["schema"] == "membrane-uncertainty/1"
-    assert table["rmse_um"]["mean"] == pytest.approx(12.5, rel=0.15)
+    assert table["rmse_um"]["mean"] == pytest.approx(262, rel=0.15)  # of a principal point by data sheet
     assert table["linear_um"]["mean"] == pytest.approx(table["rmse_um"]["mean"], rel=0.1)
     assert 0.01 < table["noise_um"]["mean"] < 0.05
     assert len(table["coeffs_sigma_um"]) == 36
@@ -73,7 +76,7 @@ def test_a_pair_shares_its_geometry(
     made: Path, analysed: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     pair = analysed("--against", str(made / "0000"), folder="0001")
-    assert pair["rmse_um"]["mean"] < 0.1
+    assert pair["rmse_um"]["mean"] < 0.5  # of 262: a bench that is off by a thousandth
     assert "change of height" in capsys.readouterr().out
 
 
@@ -94,30 +97,32 @@ def test_workers_change_nothing(analysed: Callable[..., dict[str, Any]]) -> None
 @pytest.mark.usefixtures("undrawn")
 def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     geometry = tmp_path / "geometry.toml"
-    geometry.write_text(SHORT + "alpha_sigma_deg = 0.03\n")
+    geometry.write_text(SHORT + "alpha_sigma_deg = 0.03\n" + EXACT)
     tenth = analysed("--geometry", str(geometry))
     assert tenth["geometry"]["sigmas"] == [0.0, 0.0, 0.03]
     assert tenth["rmse_um"]["mean"] == pytest.approx(0.93, rel=0.3)
     # a and b that err together by as much in opposite directions nearly cancel
-    geometry.write_text(SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, -3.9], [-3.9, 4.0]]\n')
+    geometry.write_text(
+        SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, -3.9], [-3.9, 4.0]]\n' + EXACT
+    )
     opposite = analysed("--geometry", str(geometry))
-    geometry.write_text(SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, 3.9], [3.9, 4.0]]\n')
+    geometry.write_text(SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, 3.9], [3.9, 4.0]]\n' + EXACT)
     alike = analysed("--geometry", str(geometry))
     assert opposite["rmse_um"]["mean"] < 0.5 * alike["rmse_um"]["mean"]
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_general_poses(
-    analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_general_poses(analysed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(POSES)
-    exact = analysed("--geometry", str(geometry))
-    assert "pixel noise alone" in capsys.readouterr().err
-    assert exact["rmse_um"]["mean"] < 0.05
-    geometry.write_text('[covariance]\nnames = ["screen_shift_x_mm"]\nmatrix = [[1.0]]\n' + POSES)
-    turned = analysed("--geometry", str(geometry))
-    assert turned["rmse_um"]["mean"] > 100 * exact["rmse_um"]["mean"]
+    assert analysed("--geometry", str(geometry))["rmse_um"]["mean"] > 100  # nobody is exact who does not say so
+    means = []
+    for variance in (1e-12, 1.0):
+        covariance = f'[covariance]\nnames = ["screen_shift_x_mm"]\nmatrix = [[{variance}]]\n'
+        geometry.write_text(covariance + POSES + EXACT)
+        means.append(analysed("--geometry", str(geometry))["rmse_um"]["mean"])
+    assert means[0] < 0.05
+    assert means[1] > 100 * means[0]
 
 
 class _Future:

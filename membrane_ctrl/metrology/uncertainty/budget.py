@@ -39,8 +39,13 @@ class Source:
     name: str  # ends in the unit of `sigma`
     says: str
     sigma: float  # standard uncertainty of the input; NaN for several at once
-    covariance_mm2: FloatArray  # (36, 36): of the parameters, from this input
+    effects_mm: FloatArray  # (36, k): independent changes of the parameters, of 1 sigma each, from this input
     common: bool = True  # whether all sets of a bench share it: it cancels in a change
+
+    @property
+    def covariance_mm2(self) -> FloatArray:
+        """(36, 36) of the parameters."""
+        return np.asarray(self.effects_mm @ self.effects_mm.T)
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,16 @@ class Budget:
         """(36, 36) in mm^2 of the parameters, from what all sets of the bench share or from this set's own."""
         parts = [source.covariance_mm2 for source in self.sources if source.common == common]
         return np.asarray(np.sum([np.zeros((PARAMETERS, PARAMETERS)), *parts], axis=0))
+
+    def change_covariance(self, earlier: "Budget") -> FloatArray:
+        """(36, 36) in mm^2 of the parameters' change since another set of the same bench.
+
+        What both share cancels but for the difference of its effects on the two.
+        """
+        own = self.covariance(False) + earlier.covariance(False)
+        before = {source.name: source.effects_mm for source in earlier.sources if source.common}
+        parts = [source.effects_mm - before[source.name] for source in self.sources if source.common]
+        return np.asarray(own + np.sum([part @ part.T for part in parts], axis=0))
 
     def rows(self) -> list[dict[str, Any]]:
         """Per input, the largest contribution first: its own uncertainty, 1 sigma of sag, height and figure."""
@@ -89,13 +104,12 @@ def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float =
     if linked.any():
         names = [name for name, is_linked in zip(spread.names, linked, strict=True) if is_linked]
         several = "calibrated" if set(names) & set(GENERAL_NAMES) else ", ".join(names)
-        columns = jacobian[:, linked]
-        covariance = columns @ spread.covariance[np.ix_(linked, linked)] @ columns.T
-        yield Source("geometry", f"poses and optics, with their correlations: {several}", math.nan, covariance)
+        effects = jacobian[:, linked] @ spread.root()[np.ix_(linked, linked)]
+        yield Source("geometry", f"poses and optics, with their correlations: {several}", math.nan, effects)
     for k in np.flatnonzero(~linked):
         name, sigma = spread.names[k], float(spread.sigmas[k])
         effect = jacobian[:, k] * sigma
-        yield Source(name, says.get(name, name), widened * sigma, np.outer(effect, effect))
+        yield Source(name, says.get(name, name), widened * sigma, effect[:, None])
 
 
 def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
@@ -117,7 +131,7 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
         values[parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
     effect = bench.solve(parameters.bench_at(nominal.geometry, values)) - bench.surface.parameters
     says = "growth of the frame since its distances were measured"
-    yield Source("temperature_k", says, sigmas.temperature_k, np.outer(effect, effect))
+    yield Source("temperature_k", says, sigmas.temperature_k, effect[:, None])
 
 
 def _paths(bench: TrialBench) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -139,12 +153,26 @@ def _disturbed(
 ) -> Source:
     """A source that moves the screen points by (2, n) mm per unit of the input."""
     effect = bench.solve(bench.geometry(), sigma * per_unit_mm, linear=True) - bench.surface.parameters
-    return Source(name, says, sigma, np.outer(effect, effect), common)
+    return Source(name, says, sigma, effect[:, None], common)
 
 
 def film_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
     """The film moved by this much from the x frames to the y frames, unknown to the phases."""
-    return _disturbed(bench, "film_um", says, sigma_um, moves_mm(bench) * np.array([[0.5], [-0.5]]), common=False)
+    return _disturbed(
+        bench, "film_x_to_y_um", says, sigma_um, moves_mm(bench) * np.array([[0.5], [-0.5]]), common=False
+    )
+
+
+def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
+    """The vertex is not where the laser says: towards camera and screen, or away from them."""
+    nominal = bench.geometry()
+    away = np.array([0.0, 0.0, 1e-3 * sigma_um])
+    geometry = nominal.geometry
+    farther = replace(
+        geometry, pinhole_mm=geometry.pinhole_mm + away, screen_origin_mm=geometry.screen_origin_mm + away
+    )
+    effect = bench.solve(replace(nominal, geometry=farther), linear=True) - bench.surface.parameters
+    return Source("vertex_um", says, sigma_um, effect[:, None], common=False)
 
 
 def moves_mm(bench: TrialBench) -> FloatArray:
@@ -177,38 +205,47 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
         beside = replace(bench, column_px=bench.column_px + right, row_px=bench.row_px + down)
         mean += predicted_mm(beside, nominal, bench.surface) / 4
     effect = bench.solve(bench.geometry(), mean - bench.screen_mm, linear=True) - bench.surface.parameters
-    return Source("blur_px", "blur of the picture", sigma_px, np.outer(effect, effect))
+    return Source("blur_px", "blur of the picture", sigma_px, effect[:, None])
 
 
-def light_source(bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray]) -> Source:
-    """The light of each frame is known to `LIGHT` only."""
-    scale, covariance = phase.mm_per_rad(optics.pattern), np.zeros((PARAMETERS, PARAMETERS))
+def frame_sources(
+    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float
+) -> Iterator[Source]:
+    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`."""
+    scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
+    light: list[FloatArray] = []
+    film: list[FloatArray] = []
     for axis, shifts in enumerate(shifts_rad):
         angle = bench.screen_mm[axis] / scale + phase.centre_phase_rad(optics.pattern)
         _, cosine, sine = phase.step_weights(shifts)
         for k, shift in enumerate(shifts):
-            moves = np.zeros_like(bench.screen_mm)
-            turned = cosine[k] * np.sin(angle) - sine[k] * np.cos(angle)
-            moves[axis] = -scale * turned * (1 + np.cos(angle + shift)) * LIGHT
-            effect = bench.solve(bench.geometry(), moves, linear=True) - bench.surface.parameters
-            covariance += np.outer(effect, effect)
-    return Source("light_relative", "light of each frame", LIGHT, covariance, common=False)
+            # the frame's error over the fringes' amplitude turns the phasor
+            turned = -scale * (cosine[k] * np.sin(angle) - sine[k] * np.cos(angle))
+            errors = (1 + np.cos(angle + shift)) * LIGHT, -np.sin(angle + shift) * moves[axis] / scale * film_um
+            for effects, error in zip((light, film), errors, strict=True):
+                off = np.zeros_like(bench.screen_mm)
+                off[axis] = turned * error
+                effects.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
+    yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), common=False)
+    says = "motion of the film from frame to frame that no laser has told"
+    yield Source("film_um", says, film_um, np.stack(film, axis=1), common=False)
 
 
 def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:
     """White noise of the pixels; and what the slopes show beyond it, taken as one error per patch of the mirror."""
     inverse = full.fit.normal.inverse
     middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
-    noise = inverse @ middle @ inverse
+    noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, common=False)
-    left = _left_covariance(full, inverse)
-    share = max(0.0, 1 - float(np.trace(noise)) / max(float(np.trace(left)), 1e-300))
+    left = _left_effects(full, inverse)
+    share = max(0.0, 1 - float(np.sum(noise**2)) / max(float(np.sum(left**2)), 1e-300))
+    left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
-    yield Source("slope_urad", says, 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y), share * left, False)
+    yield Source("slope_urad", says, left_urad, math.sqrt(share) * left, common=False)
 
 
-def _left_covariance(full: FullResult, inverse: FloatArray) -> FloatArray:
-    """Covariance (36, 36) of the parameters if the residual slopes are independent from patch to patch only."""
+def _left_effects(full: FullResult, inverse: FloatArray) -> FloatArray:
+    """Effects (36, patches) on the parameters if the residual slopes are independent from patch to patch only."""
     grid, side = full.grid, -(-full.grid.axis_mm.size // _PATCHES)
     edges = np.arange(0, grid.axis_mm.size, side)
 
@@ -223,7 +260,7 @@ def _left_covariance(full: FullResult, inverse: FloatArray) -> FloatArray:
     _, of_x, of_y = residuals.basis(at[0], at[1])
     slope_x, slope_y = summed(grid.count * grid.slope_x)[seen], summed(grid.count * grid.slope_y)[seen]
     pulls = (of_x * slope_x + of_y * slope_y) / radius_mm
-    return np.asarray(inverse @ (pulls @ pulls.T) @ inverse)
+    return np.asarray(inverse @ pulls)
 
 
 def slope_variance(

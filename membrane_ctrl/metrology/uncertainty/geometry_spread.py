@@ -80,10 +80,12 @@ class GeometrySpread:
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """(k,) one change."""
-        standard = rng.standard_normal(len(self.names))
+        return np.asarray(self.root() @ rng.standard_normal(len(self.names)))
+
+    def root(self) -> FloatArray:
+        """(k, k): times its transpose it is the covariance."""
         values, vectors = np.linalg.eigh(self.correlation())
-        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-        return np.asarray(self.sigmas * (root @ standard))
+        return np.asarray(self.sigmas[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
 
 
 def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:

@@ -1,0 +1,262 @@
+"""Do the error bars hold the truth? Random benches, wrong in every input of the budget at once.
+
+A bench is drawn from the sigmas that `measure` states; the ray tracer of the twin, which shares no code with the
+metrology, renders two sets minutes apart, and `measure`'s own steps measure them with the stated bench. Every second
+bench has sigmas of a hundredth, so that light, blur and motion count. The answers go to a file, line by line: a run
+that is stopped goes on where it was. `python -m benchmarks.coverage 60` measures up to 60 benches.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import Figure, at_most
+from membrane_ctrl.config.optics import (
+    CameraConfig,
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+    SigmasConfig,
+)
+from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
+from membrane_ctrl.metrology.checked import RejectedSetError, check
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
+from membrane_ctrl.metrology.witnesses import Examined, examine
+from membrane_ctrl.model.shape_estimate import judge
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
+
+FloatArray = NDArray[np.float64]
+
+BENCHES = 60
+ANSWERS = Path("logs/coverage.jsonl")
+SHRINK = 8  # 64 pixels in one: the noise of the pixels counts eight times
+POINTS = 10  # of the map, at random
+TERMS = range(3, 11)  # Noll 4..11
+CALIBRATED = 0.01  # of the default sigmas
+CAMERA = CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
+
+
+def stated_bench(calibrated: bool) -> OpticsConfig:
+    """The bench that the sets state; the twin has no glass and no air."""
+    share = CALIBRATED if calibrated else 1.0
+    sigmas = {name: share * value for name, value in SigmasConfig().model_dump().items()}
+    sigmas |= {"glass_mm": 0.0, "air_k_per_m": 0.0, "temperature_k": 0.0}
+    geometry = GeometryConfig(
+        a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, a_sigma_mm=2.0 * share, b_sigma_mm=2.0 * share,
+        alpha_sigma_deg=0.3 * share, sigmas=SigmasConfig(**sigmas), reference_displacement_um=0.0,
+    )  # fmt: skip
+    return OpticsConfig(geometry=geometry, camera=CAMERA)
+
+
+def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> OpticsConfig:
+    """The bench as it really is."""
+    spread, _ = spread_of(stated, None)
+    off = dict(zip(spread.names, spread.draw(rng), strict=True))
+    there = bench_at(Geometry.from_config(stated), np.array([off.get(name, 0.0) for name in NAMES]))
+    geometry = there.geometry
+    rows = [tuple(row) for row in geometry.rotation]
+    camera = CameraPoseConfig(position_mm=tuple(geometry.pinhole_mm), rotation=(rows[0], rows[1], rows[2]))
+    screen = ScreenPoseConfig(
+        origin_mm=tuple(geometry.screen_origin_mm),
+        s_x=tuple(geometry.screen_s_x),
+        s_y=tuple(geometry.screen_s_y),
+        bow_mm=off["bow_mm"],
+    )
+    lens = {"focal_mm": geometry.focal_px * CAMERA.pixel_um * 1e-3, "principal_px": geometry.principal_px}
+    return OpticsConfig(
+        geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
+        camera=CAMERA.model_copy(update={**lens, "distortion": geometry.distortion}),
+        pattern=stated.pattern.model_copy(update={"period_mm": stated.pattern.period_mm * there.pitch}),
+    )
+
+
+class Room:
+    """Light, blur, laser, dust and the film's motion of one bench, drawn once for both of its sets."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.gamma = float(rng.choice([1.0, rng.uniform(1.0, 2.2)]))
+        self.flicker = float(rng.choice([0.0, rng.uniform(0.0, 0.015)]))
+        self.ambient = float(rng.choice([0.0, rng.uniform(0.0, 0.05)]))
+        self.blur_px = float(rng.choice([0.0, rng.uniform(0.0, 8.0)]))
+        self.laser = bool(rng.random() < 0.6)
+        self.moves_um = float(rng.choice([0.5, rng.uniform(1.0, 30.0)]))
+        self.dust, self.stale = bool(rng.random() < 0.3), bool(rng.random() < 0.1)
+
+    def causes(self) -> list[str]:
+        """What is wrong with the sets."""
+        named = {"gamma": self.gamma > 1, "flicker": self.flicker > 0, "ambient light": self.ambient > 0}
+        named |= {"blur": self.blur_px > 0, "no laser": not self.laser, "film moves": self.moves_um > 0.5}
+        named |= {"dust": self.dust, "stale frame": self.stale}
+        return [name for name, there in named.items() if there]
+
+    def stack(self, render: Callable[[Any, float, float], FloatArray], rng: np.random.Generator) -> FrameStack:
+        """A set whose film moves by a random walk about its mean."""
+        shown = pattern_sequence("full", OpticsConfig().pattern)
+        where_um = self.moves_um * np.cumsum(rng.standard_normal(len(shown))) / math.sqrt(len(shown))
+        where_um += rng.uniform(-20.0, 20.0)
+        white = render(shown[-2], 0.0, 1.0)
+        frames = []
+        for k, (pattern, place_um) in enumerate(zip(shown, where_um, strict=True)):
+            frame = render(pattern, float(place_um), 1 + self.flicker * rng.standard_normal())
+            frame = frame + self.ambient * white / 2 * k / len(shown)
+            if self.blur_px:
+                frame = cv2.GaussianBlur(frame, (0, 0), self.blur_px / SHRINK)
+            frames.append(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
+        if self.dust:
+            for row, column in rng.integers(20, 230, (20, 2)):
+                for frame in frames[:: rng.integers(1, 3)]:
+                    frame[row : row + 2, column : column + 2] //= 2
+        if self.stale:
+            late = int(rng.integers(1, 8))
+            frames[late] = frames[late - 1]
+        readings = where_um + rng.standard_normal(len(shown)) if self.laser else np.full(len(shown), np.nan)
+        sinusoids = [k for k, pattern in enumerate(shown) if pattern.role == "sin"]
+        self.mean_um = float(where_um[sinusoids].mean())
+        return FrameStack(np.stack(frames), tuple(shown), readings, {})
+
+
+def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, Examined, str]:
+    """As `measure` does. Raises RejectedSetError."""
+    checked = check(stack, stated)
+    full = reconstruct_full(stated, checked, measure_pixels(stated, checked))
+    used = [k for axis in checked.view.used for k in axis]
+    light = checked.binned.means[used].mean(axis=0).astype(float)
+    outline = find_outline(light, checked.tracer.geometry, 500.0, checked.tracer.vertex_z_mm + full.surface.sag_mm)
+    examined = examine(stated, checked, full, spread_of(stated, None)[0], 0.5, outline)
+    verdict = judge(full.quality)[0]
+    if verdict == "ok" and (checked.flags or examined.doubts):
+        verdict = "degraded"
+    return full, examined, verdict
+
+
+def quantities(points_mm: FloatArray) -> FloatArray:
+    """Rows (n, 36): sag, Noll 4..11, height at points (2, n), of the surface's parameters."""
+    return np.vstack([sag_gradient(), parameter_to_coeffs()[list(TERMS)], height_matrix(*points_mm, 500.0)])
+
+
+def truth_of(film: FilmShape, displacement_um: float) -> FloatArray:
+    """Parameters (36,) of the true film, by least squares over the disc."""
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-500, 500, 61)] * 2))
+    inside = np.hypot(x, y) <= 500
+    x, y = x[inside], y[inside]
+    rows, height = height_matrix(x, y, 500.0), film.height_mm(x, y, displacement_um)
+    return np.asarray(np.linalg.lstsq(rows, height, rcond=None)[0])
+
+
+def bench(seed: int) -> dict[str, Any]:
+    """One bench: errors over sigmas of the first set and of the change to the second."""
+    rng = np.random.default_rng((2026, seed))
+    stated = stated_bench(calibrated=bool(seed % 2))
+    film = typical_film(37.1, 500.0, seed)
+    renderer, room = OpticsRenderer(true_bench(stated, rng), film, seed=seed), Room(rng)
+    renderer.light = Light(gamma=room.gamma)
+
+    def render(pattern: Any, displacement_um: float, gain: float) -> FloatArray:
+        return renderer.render(pattern, displacement_um, gain=gain).astype(float)
+
+    radius, angle = 475 * np.sqrt(rng.random(POINTS)), 2 * np.pi * rng.random(POINTS)
+    rows = quantities(np.stack([radius * np.cos(angle), radius * np.sin(angle)]))
+    found, answer = [], {"seed": seed, "calibrated": bool(seed % 2), "causes": room.causes()}
+    for _ in range(2):
+        try:
+            full, examined, verdict = measured(room.stack(render, rng), stated)
+        except RejectedSetError as error:
+            return answer | {"verdict": "rejected", "reason": str(error)}
+        if verdict == "rejected":
+            return answer | {"verdict": "rejected", "reason": "quality"}
+        # without a laser, which pressure the figure belongs to is unknown: the truth is at the mean
+        off = full.surface.parameters - truth_of(film, room.mean_um)
+        found.append((off, examined.budget, verdict, examined.doubts))
+    (first, budget, verdict, doubts), (second, later, _, _) = found
+    covariances = budget.covariance(True) + budget.covariance(False), later.change_covariance(budget)
+    sigma, change = (np.sqrt(np.einsum("ij,jk,ik->i", rows, c, rows)) for c in covariances)
+    return answer | {
+        "verdict": verdict,
+        "doubts": list(doubts),
+        "error_um": (1e3 * rows @ first).tolist(),
+        "sigma_um": (1e3 * sigma).tolist(),
+        "change_error_um": (1e3 * rows @ (second - first)).tolist(),
+        "change_sigma_um": (1e3 * change).tolist(),
+    }
+
+
+def answers(count: int) -> list[dict[str, Any]]:
+    """Those already known, and the missing ones."""
+    ANSWERS.parent.mkdir(exist_ok=True)
+    known = {}
+    if ANSWERS.exists():
+        known = {one["seed"]: one for one in map(json.loads, ANSWERS.read_text(encoding="utf-8").splitlines())}
+    for seed in range(count):
+        if seed not in known:
+            known[seed] = bench(seed)
+            with ANSWERS.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(known[seed]) + "\n")
+    return [known[seed] for seed in range(count)]
+
+
+def held(given: list[dict[str, Any]], of: str, part: slice = slice(None)) -> tuple[float, float, int]:
+    """Share of 95 % intervals that hold the truth, median sigma over RMS error, and intervals."""
+    pairs = [(one[f"{of}error_um"][part], one[f"{of}sigma_um"][part]) for one in given if "error_um" in one]
+    if not pairs:
+        return math.nan, math.nan, 0
+    error, sigma = np.array(pairs).transpose(1, 0, 2)
+    ratio = np.abs(error) / sigma
+    return float(np.mean(ratio < 1.96)), float(np.median(sigma) / np.sqrt(np.median(error**2)) * 0.6745), error.size
+
+
+_PARTS = {"sag": slice(0, 1), "Z4..Z11": slice(1, 9), "map": slice(9, None)}
+
+
+def run(count: int = BENCHES) -> list[Figure]:
+    """Coverage by quantity, for heights and for changes."""
+    given = answers(count)
+    figures = []
+    for state in (False, True):
+        some = [one for one in given if one["calibrated"] == state]
+        name = "sigmas / 100" if state else "sigmas by hand"
+        for of, what in (("", "height"), ("change_", "change")):
+            for quantity, part in _PARTS.items():
+                share, width, size = held(some, of, part)
+                label = f"{name}, {what}: {quantity} in its 95 % interval ({size})"
+                figures.append(Figure(label, 100 * share, "%", "width over scatter", width, "93 .. 97"))
+    sure = [one for one in given if one["verdict"] == "ok"]
+    far = sum(max(np.abs(one["error_um"]) / np.array(one["sigma_um"])) > 3 for one in sure)
+    label = f"'ok' with an error above 3 sigma, of {len(given)}"
+    figures.append(at_most(label, 100 * far / len(given), "%", 0.5))
+    figures.append(Figure("rejected", 100 * sum(one["verdict"] == "rejected" for one in given) / len(given), "%"))
+    return figures
+
+
+def table(given: list[dict[str, Any]]) -> list[str]:
+    """Coverage for the sets with each cause, as lines of a page."""
+    lines = ["| cause | benches | height % | change % | width of change over scatter |", "|---|---|---|---|---|"]
+    every = sorted({cause for one in given for cause in one["causes"]})
+    for cause in ["(all)", *every]:
+        some = [one for one in given if cause == "(all)" or cause in one["causes"]]
+        height, change = held(some, ""), held(some, "change_")
+        lines.append(f"| {cause} | {len(some)} | {100 * height[0]:.0f} | {100 * change[0]:.0f} | {change[1]:.1f} |")
+    return lines
+
+
+if __name__ == "__main__":
+    wanted = int(sys.argv[1]) if len(sys.argv) > 1 else BENCHES
+    for figure in run(wanted):
+        print(f"{figure.name}: {figure.value:.1f} {figure.unit} {figure.reference_value or ''}")
+    print("\n".join(table(answers(wanted))))
