@@ -162,7 +162,7 @@ def _foreseen(
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).over(optics)
-    known = parameters.sigmas({**stated_sigmas(optics.geometry), **freed(solving.free)})
+    known = parameters.sigmas({**stated_sigmas(optics), **freed(solving.free)})
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
         return propagate.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)

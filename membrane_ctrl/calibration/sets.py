@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
@@ -189,15 +189,16 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
                 )
 
 
-def stated_sigmas(stated: GeometryConfig) -> dict[str, float]:
-    """The stated sigmas of the manual measurements."""
+def stated_sigmas(optics: OpticsConfig) -> dict[str, float]:
+    """The sigmas of what rulers and data sheets say of poses, lens and screen; 0 holds a number where it is."""
+    stated = optics.geometry
     given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}
-    return {name: sigma for name, sigma in given.items() if sigma is not None}
+    return spread_file.sigmas_of(optics) | {name: sigma for name, sigma in given.items() if sigma is not None}
 
 
 def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
     """The stated bench with its sigmas. Raises InputError if the geometry cannot be calibrated."""
-    own = stated_sigmas(bundle.optics.geometry)
+    own = stated_sigmas(bundle.optics)
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:

@@ -51,7 +51,7 @@ class Checked:
     tracer: reconstruct.Tracer  # the bench, with the vertex where the laser saw it
     state: motion.TrackedPoints  # the bins' points with their surface
     flags: tuple[integrity.Flag, ...]  # frames that do not belong
-    moved_um: float  # RMS over the used sinusoids: how far the film is from where laser and surface put it
+    film_um: FloatArray  # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -176,9 +176,10 @@ def _check(
             _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
             shape = attempt.view.mask.shape
             fitted = (attempt.view, attempt.phase_rad, near.reshape(shape), attempt.tracer, attempt.state)
-            moved = [seen[k].moved_um for used in attempt.view.used for k in used]
-            moved_um = float(np.sqrt(np.mean(np.square(moved))))
-            return Checked(stack, binned, *fitted, _merged(flags, known), moved_um)
+            used = [k for axis in attempt.view.used for k in axis]
+            told_um = np.nan_to_num(stack.displacement_um[used] - stack.mean_reading_um)
+            film_um = told_um + [seen[k].moved_um for k in used]
+            return Checked(stack, binned, *fitted, _merged(flags, known), film_um)
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if pair is not None and pair.swapped_with is not None and not {pair.frame, pair.swapped_with} & set(known):
             order = list(range(len(stack.patterns)))

@@ -45,7 +45,7 @@ def blur_px(checked: Checked) -> float:
 
 
 @dataclass(frozen=True)
-class Motion:
+class UnseenMotion:
     """Film displacement from the x frames to the y frames, as the fringes show it."""
 
     moved_um: float
@@ -62,7 +62,7 @@ class Motion:
         return math.hypot(self.moved_um, self.sigma_um)
 
 
-def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> Motion:
+def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
     """Ask the fringes whether the film moved between the x and the y frames.
 
     Slopes in x of one bowl and slopes in y of another do not integrate to a surface. Least squares over the 36
@@ -84,7 +84,7 @@ def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> Motion:
     variance = float(np.mean(left**2))
     covariance = np.linalg.inv(inputs.T @ inputs / variance + np.eye(inputs.shape[1]))
     answer = covariance @ (inputs.T @ left) / variance
-    return Motion(_UNSEEN_UM * float(answer[-1]), _UNSEEN_UM * math.sqrt(covariance[-1, -1]))
+    return UnseenMotion(_UNSEEN_UM * float(answer[-1]), _UNSEEN_UM * math.sqrt(covariance[-1, -1]))
 
 
 def _rim_failed(outline: Outline) -> bool:
@@ -156,10 +156,10 @@ def examine(
     sources = [
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *budget.bench_sources(bench, sigmas),
-        *film,
+        film,
         _vertex(bench, sigmas, checked),
         blur,
-        *budget.frame_sources(bench, optics, shifts, _film_um(checked)),
+        *budget.frame_sources(bench, optics, shifts, _film_um(checked), math.isfinite(checked.stack.mean_reading_um)),
         *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),
     ]
     return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
@@ -176,21 +176,27 @@ def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked) -> budget
 
 
 def _film_um(checked: Checked) -> float:
-    """Motion of the film at a frame, 1 sigma, that is left in the phases: what neither laser nor fringes rule out."""
+    """RMS motion of the film left in the phases of the frames: what the fringes see, less what was taken out."""
     readings = checked.stack.readings_um
-    if not np.isfinite(readings).all():
-        return checked.moved_um
-    known = motion.worth_correcting(readings, LASER_NOISE_UM)
-    return math.hypot(LASER_NOISE_UM if known else float(np.std(readings)), checked.moved_um)
+    if not motion.worth_correcting(readings, LASER_NOISE_UM):
+        return float(np.sqrt(np.mean(checked.film_um**2)))
+    used = [k for axis in checked.view.used for k in axis]
+    told_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um
+    return float(np.sqrt(np.mean(np.square(checked.film_um - told_um))))
 
 
-def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[list[budget.Source], list[str]]:
-    """The film's motion from x to y where no laser tells it: by the fringes."""
-    if np.isfinite(checked.stack.readings_um).all():
-        return [], []
+def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[budget.Source, list[str]]:
+    """The film's motion from x to y: by the laser, else by the fringes."""
+    readings = checked.stack.readings_um
+    if np.isfinite(readings).all():
+        of_axes = np.split(readings, 2)
+        corrected = motion.worth_correcting(readings, LASER_NOISE_UM)
+        left_um = 0.0 if corrected else float(np.mean(of_axes[0]) - np.mean(of_axes[1]))
+        sigma_um = math.hypot(left_um, LASER_NOISE_UM * math.sqrt(4 / readings.size))
+        return budget.film_source(bench, sigma_um, "motion of the film from x to y, by the laser"), []
     moved = unseen_motion(bench, spread)
     source = budget.film_source(bench, moved.uncertain_um, "motion of the film from x to y, without a laser")
     if not moved.sure:
-        return [source], []
+        return source, []
     says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} um from the x to the y frames"
-    return [source], [f"{says}, seen in the fringes: record the laser's readings"]
+    return source, [f"{says}, seen in the fringes: record the laser's readings"]

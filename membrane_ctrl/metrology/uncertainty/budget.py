@@ -209,9 +209,12 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
 
 
 def frame_sources(
-    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float
+    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float, mean_known: bool
 ) -> Iterator[Source]:
-    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`."""
+    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`.
+
+    `mean_known`: a laser tells the film's mean, to which the figure then refers.
+    """
     scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
     light: list[FloatArray] = []
     film: list[FloatArray] = []
@@ -228,7 +231,8 @@ def frame_sources(
                 effects.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
     yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), common=False)
     says = "motion of the film from frame to frame that no laser has told"
-    yield Source("film_um", says, film_um, np.stack(film, axis=1), common=False)
+    mean = np.mean(film, axis=0) if mean_known else np.zeros(PARAMETERS)
+    yield Source("film_um", says, film_um, np.stack(film, axis=1) - mean[:, None], common=False)
 
 
 def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:

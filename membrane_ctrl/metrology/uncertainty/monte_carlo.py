@@ -66,7 +66,7 @@ class TrialBench:
         count: int,
     ) -> "TrialBench":
         """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
-        chosen = _spread_evenly(points.t_mm.size, count)
+        chosen = _spread_evenly(place_px, optics.camera.width_px, count)
         thinning = points.t_mm.size / np.count_nonzero(chosen)
         points = points.subset(chosen)
         column_px, row_px = place_px[:, chosen]
@@ -119,12 +119,16 @@ class TrialBench:
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
 
 
-def _spread_evenly(size: int, count: int) -> BoolArray:
-    """About `count` of `size` points by a golden-ratio sequence: even along rows and columns alike."""
+def _spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
+    """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows and columns alike.
+
+    A place is chosen in every set or in none, so that sets of one bench can be compared.
+    """
+    size = place_px.shape[1]
     if size <= count:
         return np.ones(size, bool)
-    place = (np.arange(size) * ((np.sqrt(5) - 1) / 2)) % 1
-    return np.asarray(place < count / size)
+    turn = ((np.rint(place_px[1]) * width_px + np.rint(place_px[0])) * ((np.sqrt(5) - 1) / 2)) % 1
+    return np.asarray(turn < count / size)
 
 
 def run_trials(
