@@ -81,7 +81,9 @@ def test_from_folders_to_a_better_figure(folders: list[Path], calibrated: Path, 
         # the signs of the twin's turns are the parameters' but for the rows' own sense
         assert abs(abs(found[name]["value"]) - abs(true)) < 4 * found[name]["sigma"], name
         assert found[name]["sigma"] < found[name]["sigma_before"], name
-    assert found["focal_relative"]["sigma"] < 0.1 * found["focal_relative"]["sigma_before"]  # lens and screen are free
+    assert (
+        found["focal_relative"]["sigma"] < 0.1 * found["focal_relative"]["sigma_before"]
+    )  # lens and screen are free
     before, after = (tmp_path / name for name in ("before", "after"))
     assert run(["measure", str(folders[2]), "--out", str(before), "--no-pictures"]) == 0
     assert run(["measure", str(folders[2]), "--geometry", str(out), "--out", str(after), "--no-pictures"]) == 0
