@@ -29,7 +29,6 @@ WITHOUT_UNIT = {
     "setpoint_weight",
 }
 WITHOUT_UNIT |= {"focal_relative", "pitch_relative", "laser_relative", "k1", "k2", "p1", "p2"}
-WITHOUT_UNIT |= {"air_k_per_m"}  # a kelvin a metre is not in the list of units
 
 
 @pytest.mark.parametrize(("title", "key"), ALL, ids=lambda value: getattr(value, "name", value))
