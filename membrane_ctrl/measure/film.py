@@ -82,7 +82,7 @@ def film_command(options: FilmOptions) -> int:
 
 def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fit.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
-    spread, source = spread_file.spread_of(sets[0].head.optics.geometry, geometry)
+    spread, source = spread_file.spread_of(sets[0].head.optics, geometry)
     root = np.linalg.cholesky(spread.correlation() + 1e-9 * np.eye(len(spread.sigmas)))
     out = []
     for one in sets:
