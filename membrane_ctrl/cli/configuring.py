@@ -73,6 +73,6 @@ def init(
     ] = False,
 ) -> int:
     """Write a first configuration, with what is connected; on a terminal, ask for the devices."""
-    from membrane_ctrl.commissioning.first_config import write_first
+    from membrane_ctrl.commissioning.devices import write_first
 
     return write_first(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)

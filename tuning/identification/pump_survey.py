@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.pump_map import PumpStep
+from membrane_ctrl.control.experiments.trial import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
 

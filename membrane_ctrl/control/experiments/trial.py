@@ -1,15 +1,27 @@
 """One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from firmware_iface.settings import Section
+from firmware_iface.settings import Fraction, Section
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments import machine, pump_map
+from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.control.gas import PumpCurve
 
 # Specification of an experiment: plain data with bounds, as it comes over the control port.
+
+
+_Short = AfterValidator(lambda value: round(value, 3))  # ninety steps fit one message
+
+
+class PumpStep(Section):
+    """A command until the time is over or, if a height is given, the centre has sunk (command 0) or risen to it."""
+
+    fraction: Annotated[Fraction, _Short]
+    duration_s: Annotated[float, Field(ge=0.01, le=120), _Short]
+    until_um: Annotated[float, Field(ge=-30, le=30), _Short] | None = None  # from where the experiment began
 
 
 ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
@@ -29,7 +41,36 @@ class ExperimentSpec(Section):
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
-    steps: Annotated[tuple[pump_map.PumpStep, ...], Field(max_length=90)] = ()  # of the pump map
+    steps: Annotated[tuple[PumpStep, ...], Field(max_length=90)] = ()  # of the pump map
+
+
+class PumpSteps:
+    """The experiment behind the pump's curve: constant pump commands, 0..1; the mirror is the flow meter.
+
+    The session (`tuning`) decides which commands, for how long and until which height, between two experiments.
+    """
+
+    def __init__(self, centre_um: float, steps: Sequence[PumpStep]) -> None:
+        self._centre_um = centre_um
+        self._steps = list(steps)
+        self._motion = machine.CentreMotion()
+        self._in_step_s = 0.0
+
+    def step(self, measurement: machine.BenchSample, dt_s: float) -> float | machine.Finished:
+        """One tick: the command until the next reading, or the end."""
+        self._motion.update(measurement.displacement_um, dt_s)
+        self._in_step_s += dt_s
+        if self._over():
+            self._steps.pop(0)
+            self._in_step_s = 0.0
+        return self._steps[0].fraction if self._steps else machine.Finished(True, "pump mapped")
+
+    def _over(self) -> bool:
+        """Whether the present step is."""
+        now, off_um = self._steps[0], self._motion.position_um - self._centre_um
+        if now.until_um is not None and (off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um):
+            return True
+        return self._in_step_s > now.duration_s
 
 
 _PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
@@ -62,7 +103,7 @@ class Trial:
         if spec.kind == "pump_map":
             if not spec.steps:
                 raise ValueError("a pump map without steps: use `tune pump`")
-            return pump_map.PumpSteps(centre_um, spec.steps)
+            return PumpSteps(centre_um, spec.steps)
         return machine.Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
 
     @property
