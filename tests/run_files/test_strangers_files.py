@@ -153,7 +153,8 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 
 # Who else writes, and why it is no stranger's folder.
 _OWN = {
-    # the recorder, in the folder that its run has just made
+    # the recorder and the start of a hold, in the folder that the run has just made
+    "hold/start.py",
     "run_files/sealed_stream.py", "run_files/events.py", "recorder/recorder.py",
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
@@ -163,12 +164,12 @@ _OWN = {
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
     "review/export.py", "calibration/session.py", "calibration/camera.py",
-    "calibration/sets.py", "geometry/spread_file.py", "commissioning/devices.py",
+    "calibration/sets.py", "geometry/spread_file.py", "commissioning/devices.py", "commissioning/new_device.py",
     # the project's own pages
     # shared memory
     "processes/frames.py", "processes/ring.py",
     # into memory, and from there by `model.files`
-    "measure/results.py", "review/report/figures.py",
+    "measure/results.py", "measure/figure_results.py", "measure/export_figure.py", "review/report/figures.py",
 }  # fmt: skip
 _WRITES = re.compile(
     r"""\.write_(text|bytes)\(|open\(\s*(str\()?[\w./]*,?\s*["'](w|a|x|r\+)|\.open\(["'](w|a|x|r\+)|np\.savez|savefig\("""
