@@ -83,11 +83,13 @@ def film_command(options: FilmOptions) -> int:
 def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fit.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
     spread, source = spread_file.spread_of(sets[0].head.optics, geometry)
-    root = np.linalg.cholesky(spread.correlation() + 1e-9 * np.eye(len(spread.sigmas)))
     out = []
     for one in sets:
         bench, surface = one.bench(), one.figure.fit.surface
-        noise, geometric = monte_carlo.noise_covariance(bench), monte_carlo.geometry_jacobian(bench, spread) @ root
+        noise, geometric = (
+            monte_carlo.noise_covariance(bench),
+            monte_carlo.geometry_jacobian(bench, spread) @ spread.root(),
+        )
         name, pressure = one.head.folder.name, one.head.pressure_pa
         out.append(film_fit.FilmFigure(name, surface.parameters, noise, geometric, pressure, surface.sag_mm))
     return out, source
