@@ -66,11 +66,11 @@ class ErrorBars:
         return of_noise, of_geometry
 
 
-def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline | None) -> ErrorBars | None:
+def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline | None = None) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
     Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to propagate.
-    `geometry` is the file with the covariance, `outline` the rim in the picture.
+    `geometry` is the file with the covariance, `outline` the rim in the picture, a witness of the geometry.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:

@@ -154,7 +154,7 @@ def test_what_is_generated_goes_everywhere() -> None:
     """The properties above would not cover states that their examples never reach."""
     seen: set[State] = set()
 
-    @settings(max_examples=120, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=240, deadline=None, derandomize=True, database=None)
     @given(warms, st.lists(steps, min_size=10, max_size=40))
     def walk(warm: int, given_steps: list[tuple]) -> None:  # type: ignore[type-arg]
         driver = Driver(warm)

@@ -218,14 +218,14 @@ class FilmShape:
     sag_mm: float  # depth of the bowl (rim above vertex, without the other terms) at displacement 0
     radius_mm: float = 500.0
     bowl: Literal["hencky", "paraboloid"] = "hencky"
-    # of a Hencky bowl: strain of the flat film before it was clamped, and the material's Poisson ratio
-    prestrain: float = 0.0
-    poisson: float = gas_film.POISSON_PET
     # Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect)
     zernike_um: tuple[float, ...] = ()
     ripples: tuple[Ripple, ...] = ()
     wrinkles: tuple[Wrinkle, ...] = ()
     bumps: tuple[Bump, ...] = ()
+    # of a Hencky bowl: strain of the flat film before it was clamped, and the material's Poisson ratio
+    prestrain: float = 0.0
+    poisson: float = gas_film.POISSON_PET
     terms: FilmTerms = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
