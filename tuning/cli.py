@@ -54,7 +54,7 @@ _STEPS = {
     "verify": "Verify the new gains over ten minutes of hold; keep them, or revert (exit 3).",
     "run": "Run all steps that are not done yet; shows the candidates and asks before any gains change.",
     "pump": "Measure the pump's curve (flow, start, stall, delay) and the leak, for [pump].",
-    "outer": "Measure sag sensitivity, noise and drift of the figure; try the shape loop's time constant that follows.",
+    "outer": "Measure sag sensitivity, noise and drift of the figure; try a time constant for the shape loop.",
     "watch": "Watch a hold without touching it; report whether a session is due (exit 3).",
     "rollback": "Restore the gains from before the last kept session.",
 }
