@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing import Pool
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -30,7 +29,7 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import second_world
-from tuning import command, gains_file, session, twin_hold
+from tuning import command, gains_file, opening, session
 
 DEFAULT_FILE = Path("build/benches.jsonl")
 SETTLE_S, HOLD_S = 120.0, 600.0
@@ -138,15 +137,15 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     found |= _held("default", bench, config)
     if "default_error" in found:
         return found
-    hold: list[twin_hold.TwinHold] = []
+    hold: list[opening.TwinHold] = []
 
-    def opened(given: Config) -> twin_hold.TwinHold:
+    def opened(given: Config) -> opening.TwinHold:
         hold.append(twin_hold_of(bench, given, 1))
         return hold[-1]
 
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch.object(command, "twin_hold", SimpleNamespace(TwinHold=opened)),
+        patch.object(opening, "TwinHold", opened),
     ):
         told = io.StringIO()
         try:
@@ -166,8 +165,8 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     return found
 
 
-def _options(config: Config, logs: Path) -> command.TuneOptions:
-    return command.TuneOptions(
+def _options(config: Config, logs: Path) -> opening.TuneOptions:
+    return opening.TuneOptions(
         config=config, twin=True, where=Where(), logs=logs, session=None, name="bench", author="benchmark",
         reason="drawn bench", limit_um=LIMIT_UM, observe_s=session.OBSERVE_S, verify_s=600.0, take_over=False,
         yes=True, choose="", json=False,
@@ -185,9 +184,9 @@ def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     return found | _held("tuned", bench, tuned)
 
 
-def twin_hold_of(bench: DrawnBench, config: Config, weather_seed: int) -> twin_hold.TwinHold:
+def twin_hold_of(bench: DrawnBench, config: Config, weather_seed: int) -> opening.TwinHold:
     """A hold of the bench in virtual time."""
-    return twin_hold.TwinHold(config, bench=second_world.foreign_bench(bench.plant(weather_seed)))
+    return opening.TwinHold(config, bench=second_world.foreign_bench(bench.plant(weather_seed)))
 
 
 def _held(name: str, bench: DrawnBench, config: Config) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions.folder import SessionFolder, open_session
 from membrane_ctrl.sessions.live_hold import HoldLink, Progress
-from tuning import gains_file, session
+from tuning import gains_file, pump_trial, session
 from tuning.identification.loop_model import Gains
 from tuning.proposal import candidates, design, trade
 from tuning.rig import HoldRig
@@ -104,7 +104,7 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     gains = _kept(folder)
     config = toml_file.load(path, schema.Config)
     pump = folder.config.pump
-    replaces = session.mapped(folder) and config.pump == session.mapped_of(folder).before
+    replaces = pump_trial.mapped(folder) and config.pump == pump_trial.mapped_of(folder).before
     _require_same_bench(path, config.model_copy(update={"pump": pump}) if replaces else config, folder)
     before = files.read_text(path, follow=True)
     changed = {"loop": _changes(config.loop, gains, GAIN_KEYS), "pump": _changes(config.pump, pump)}
@@ -138,7 +138,7 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
 
     Raises InputError if there are none, or they were rolled back.
     """
-    if session.mapped(folder) and not (folder.done("verify") and session.verified_of(folder).kept):
+    if pump_trial.mapped(folder) and not (folder.done("verify") and session.verified_of(folder).kept):
         return folder.head.before
     done = session.verified_of(folder)
     if not done.kept:

@@ -11,7 +11,7 @@ import typer
 from membrane_ctrl.model import clock, errors
 
 if TYPE_CHECKING:
-    from tuning.command import TuneOptions
+    from tuning.opening import TuneOptions
 
 
 app = typer.Typer(
@@ -86,16 +86,16 @@ def _step(name: str) -> None:
     ) -> int:
         from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
-        from tuning import command as tune
+        from tuning import opening
 
-        options = tune.TuneOptions(
+        options = opening.TuneOptions(
             config=schema.Config() if config is None else toml_file.load(config, schema.Config),
             twin=twin,
             where=Where(socket, run, logs=logs),
             logs=logs,
             session=session,
             name=session_name,
-            author=author or tune.author_name(),
+            author=author or opening.author_name(),
             reason=reason,
             limit_um=limit_um,
             observe_s=clock.parse_duration_s(observe),
@@ -152,9 +152,9 @@ def save(
     yes: Annotated[bool, typer.Option("--yes", help="Save without asking.")] = False,
 ) -> int:
     """Save the kept gains of a session into a configuration, so that the next hold starts with them."""
-    from tuning import choice, command
+    from tuning import choice, opening
 
-    return choice.save(config, session, logs, author or command.author_name(), yes)
+    return choice.save(config, session, logs, author or opening.author_name(), yes)
 
 
 @app.command()
@@ -178,7 +178,8 @@ def explore(
     author: AuthorOption = None,
 ) -> int:
     """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a session live."""
-    from tuning.command import NEEDS_BOKEH, author_name
+    from tuning.command import NEEDS_BOKEH
+    from tuning.opening import author_name
 
     try:
         from tuning.explore.page import explore

@@ -1,27 +1,22 @@
 """`tune`: sessions on a running hold or on the twin, step by step or all at once."""
 
-import contextlib
-import getpass
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError, writing
 from membrane_ctrl.sessions import folder as plain
-from membrane_ctrl.sessions.folder import STEPS, SessionFolder, create_session, newest_session, open_session
-from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, Progress, live_hold
-from membrane_ctrl.sessions.live_log import LiveLog
-from tuning import choice, gains_file, report, session, twin_hold
-from tuning.identification.characterise import FULL, SHORT, Plan
+from membrane_ctrl.sessions.folder import STEPS, SessionFolder
+from membrane_ctrl.sessions.live_hold import HoldError, Progress
+from tuning import choice, gains_file, opening, pump_trial, report, session
 from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S
-from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, Stage
+from tuning.opening import TuneOptions
+from tuning.proposal.verify import SETTLE_LEAST_S, Stage
 from tuning.rig import HoldRig
 
 _TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
@@ -29,58 +24,16 @@ NEEDS_BOKEH = "{} needs Bokeh: pip install 'membrane-ctrl[web]'"
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 
-@dataclass(frozen=True, slots=True)
-class TuneOptions:
-    """Options of the command line."""
-
-    config: Config
-    twin: bool
-    where: Where
-    logs: Path
-    session: Path | None
-    name: str
-    author: str
-    reason: str
-    limit_um: float
-    observe_s: float
-    verify_s: float
-    take_over: bool
-    yes: bool
-    choose: str
-    json: bool
-    page: bool = False
-    short: bool = False
-    wait: bool = False
-
-    @property
-    def plan(self) -> Plan:
-        """Of the experiments."""
-        return SHORT if self.short else FULL
-
-    @property
-    def stages(self) -> tuple[tuple[float, float], ...]:
-        """Stages of the verification that fit in the time available."""
-        share = self.verify_s / STAGES[-1][0]
-        return tuple((share * until_s, growth) for until_s, growth in STAGES)
-
-
-def author_name() -> str:
-    """Login name."""
-    with contextlib.suppress(OSError, KeyError):
-        return getpass.getuser()
-    return "unknown"
-
-
 def run_session(options: TuneOptions) -> int:
     """Run all steps that are not done yet and return the exit code; raises like `one_step`."""
     choice.require_an_answer(options.yes, options.choose, known=options.session is None)
-    with _session(options) as (folder, rig, progress):
+    with opening.opened(options) as (folder, rig, progress):
         if options.page:
             progress.say(f"live page: {_served(folder, options)}session")
         try:
             _do_all([step for step in STEPS if not folder.done(step)], folder, rig, options, progress)
         except session.PumpUnknownError as error:
-            if session.mapped(folder):
+            if pump_trial.mapped(folder):
                 raise
             progress.say(str(error))
             folder = _map_pump(folder, rig, options.limit_um, progress)
@@ -107,11 +60,12 @@ def one_step(step: str, options: TuneOptions) -> int:
     if step == "apply":
         choice.require_an_answer(options.yes, options.choose, known=options.session is None)
     if step not in _MOVES:
-        folder = _folder(options, None)
+        folder = opening.folder_of(options, None)
         with writing(folder.path, DeviceError):
             _do(step, folder, None, options, Progress())
     else:
-        with _session(options, fresh=step == "characterise" and options.session is None) as (folder, rig, progress):
+        fresh = step == "characterise" and options.session is None
+        with opening.opened(options, fresh) as (folder, rig, progress):
             _do_all([step], folder, rig, options, progress)
     return _concluded(folder, options)
 
@@ -129,14 +83,14 @@ def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneO
 
 def map_pump(options: TuneOptions) -> int:
     """Measure the pump's curve and apply it; the session begins anew on it."""
-    with _session(options) as (folder, rig, progress):
+    with opening.opened(options) as (folder, rig, progress):
         folder = _map_pump(folder, rig, options.limit_um, progress)
     return _concluded(folder, options)
 
 
 def _map_pump(folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress) -> SessionFolder:
     progress.begin("pump", PUMP_TYPICAL_S, 0.0)
-    mapped, folder = session.map_pump(folder, rig, limit_um)
+    mapped, folder = pump_trial.map_pump(folder, rig, limit_um)
     found, pump = mapped.found, mapped.found.pump
     progress.say(
         f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
@@ -162,7 +116,7 @@ def outer(options: TuneOptions) -> int:
     from tuning.identification import shape_loop
 
     assumed = zernike_projection()
-    with _session(options) as (folder, rig, progress):
+    with opening.opened(options) as (folder, rig, progress):
         before_s = folder.config.shape.time_constant_s
         progress.begin("shape loop", shape_loop.TYPICAL_S + options.observe_s, options.verify_s)
         rig.hold(options.observe_s)
@@ -214,10 +168,10 @@ def watch(options: TuneOptions) -> int:
     """Observe a hold and report whether a session is due (exit 3)."""
     from tuning.proposal.verify import health
 
-    folder = _folder(options, None)
+    folder = opening.folder_of(options, None)
     folder.require("design")
     made = gains_file.load_gains(folder.file("gains.toml"))
-    with _link(options) as link:
+    with opening.linked(options) as link:
         progress = Progress()
         rig = HoldRig(link, options.author, progress)
         progress.begin("watch", options.observe_s, 0.0)
@@ -242,7 +196,7 @@ def rollback(options: TuneOptions) -> int:
     """Restore the gains from before the last kept session."""
     kept = gains_file.to_roll_back(options.logs)
     progress = Progress()
-    with _link(options) as link:
+    with opening.linked(options) as link:
         rig = HoldRig(link, options.author, progress)
         try:
             shape_s = kept.shape_s[0] if kept.shape_s else math.nan
@@ -360,67 +314,6 @@ def _begin(progress: Progress, options: TuneOptions, step: str, after: list[str]
         "verify": SETTLE_LEAST_S + options.verify_s,
     }
     progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
-
-
-@contextlib.contextmanager
-def _session(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Yield a session's folder and hold; restore the last good gains if it ends early."""
-    progress = Progress()
-    with _link(options) as link:
-        folder = _folder(options, link, fresh)
-        rig = HoldRig(link, options.author, progress)
-        rig.good = folder.head.before, folder.config.pump
-        progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.say)
-        rig.seen = progress.log.tick
-        with progress.catching():
-            try:
-                rig.end_experiment()  # of a session that was killed
-                with writing(folder.path, DeviceError):
-                    yield folder, rig, progress
-                progress.note("ended", "done")
-            except BaseException as error:
-                _go_back(rig, progress)
-                progress.note("ended", str(error) or "interrupted")
-                progress.say(f"resume it with `membrane-ctrl tune run --resume {folder.path}`")
-                if isinstance(error, HoldError):
-                    raise DeviceError(str(error)) from None
-                raise
-
-
-def _go_back(rig: HoldRig, progress: Progress) -> None:
-    progress.interrupted = False
-    try:
-        rig.go_back()
-    except HoldError as error:
-        progress.say(f"could not restore the last good gains ({error}); gains on trial revert automatically")
-        return
-    progress.say("holding the mirror with the last good gains")
-
-
-def _link(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
-    if not options.twin:
-        return live_hold(options.where, options.take_over, wait=options.wait)
-    config = open_session(options.session).config if options.session is not None else options.config
-    try:
-        return contextlib.closing(twin_hold.TwinHold(config))
-    except HoldError as error:
-        raise DeviceError(str(error)) from None
-
-
-def _folder(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
-    """Return the named session, else the newest, or a new one if there is a hold to start it on."""
-    if link is None:
-        return newest_session(options.logs) if options.session is None else open_session(options.session)
-    if options.session is not None:
-        return choice.for_hold(open_session(options.session), link)
-    begun: SessionFolder | None = None
-    if not fresh:
-        with contextlib.suppress(InputError):
-            begun = newest_session(options.logs)
-    of = None if begun is None else (begun.head.source, begun.head.name)
-    if begun is not None and of == (link.name, options.name) and not begun.done("verify"):
-        return choice.for_hold(begun, link)
-    return create_session(options.logs, options.name, options.author, link.name, link.config, link.config.loop)
 
 
 def _concluded(folder: SessionFolder, options: TuneOptions) -> int:

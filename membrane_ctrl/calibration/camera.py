@@ -1,4 +1,4 @@
-"""The commands that calibrate the camera alone: `calibrate-camera` its lens, `calibrate-pose` its pose."""
+"""The commands that calibrate camera and screen alone: `calibrate-camera`, `calibrate-pose`, `calibrate-display`."""
 
 import json
 import sys
@@ -10,7 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from membrane_ctrl.config.schema import CameraConfig, Config
+from firmware_iface.display import DisplayResponse, Settling
+from firmware_iface.roles import LinkError
+from membrane_ctrl.acquisition import exposures, optical_bench, session
+from membrane_ctrl.config.schema import CameraConfig, Config, PatternConfig
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior, write_prior
 from membrane_ctrl.measure import capture_set, measurement
@@ -21,8 +24,10 @@ from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calib
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.phase import mm_per_rad
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.clock import RunClock
 
 _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
@@ -63,7 +68,7 @@ def calibrate_camera(options: CameraOptions) -> int:
 
 
 def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
-    """Write the board as a picture for a screen of the given size in pixels. Raises InputError."""
+    """Write the board as a picture for a screen of the given size in pixels. Raises errors.InputError."""
     try:
         levels = on_screen(_board(board_text), square_px, width_px, height_px)
     except ValueError as error:
@@ -198,7 +203,7 @@ def calibrate_pose(options: PoseOptions) -> int:
 
 
 def _light(capture: capture_set.CaptureSet) -> FloatArray:
-    """White minus black. Raises InputError for a set without them."""
+    """White minus black. Raises errors.InputError for a set without them."""
     names = [pattern.name for pattern in capture.head.patterns]
     if "white" not in names:
         raise errors.InputError(
@@ -236,3 +241,79 @@ def _pose_lines(pose: ring_pose.RingPose, out: Path) -> list[str]:
     better = max(usual_sigma(name) / sigma for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True))
     lines.append(f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} times better")
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]
+
+
+_PHASES = 720  # per period, to include the worst one
+
+
+def calibrate_display(config: Config, source: str, as_json: bool) -> int:
+    """Open camera and screen, measure, and report the resulting error. Raises CommandError.
+
+    Call from the main thread only (because of the screen).
+    """
+    if config.devices is None or config.devices.camera is None or config.devices.screen is None:
+        raise errors.InputError(f"{source}: devices.camera and devices.screen are both needed to measure the screen")
+    section, clock = config.devices.screen, session.WaitingClock(RunClock.start())
+    try:
+        bench = optical_bench.configured_bench(config, clock)
+        try:
+            settling, response = measured(bench, clock, section.width_px, section.height_px)
+        finally:
+            bench.close()
+    except LinkError as error:
+        raise errors.DeviceError(f"{source}: {error}") from None
+    except ValueError as error:
+        raise errors.DeviceError(f"{source}: screen: {error}") from None
+    report = report_of(settling, response, config.optics.pattern)
+    print(json.dumps(report) if as_json else "\n".join(lines_of(report)))
+    return int(errors.Exit.DONE)
+
+
+def measured(
+    bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
+) -> tuple[Settling, DisplayResponse]:
+    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot see the screen."""
+    bench.camera.open()
+    bench.screen.open()
+    test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
+    return test.settling(), test.response()
+
+
+def report_of(settling: Settling, response: DisplayResponse, pattern: PatternConfig) -> dict[str, object]:
+    """The findings, schema membrane-calibrate-display/1."""
+    bare, corrected = (fringe_error_mm(response, pattern, linear) for linear in (False, True))
+    return {
+        "schema": "membrane-calibrate-display/1",
+        "settle_ms": 1e3 * settling.settle_s,
+        "latency_ms": 1e3 * settling.latency_s if np.isfinite(settling.latency_s) else None,
+        "time_constant_ms": 1e3 * settling.tau_s if np.isfinite(settling.tau_s) else None,
+        "gamma": response.gamma,
+        "fringe_error_um": {"as_sent": 1e3 * bare, "corrected": 1e3 * corrected},
+    }
+
+
+def lines_of(report: dict[str, object]) -> list[str]:
+    """Format the report for people, with the lines for the configuration."""
+    error = report["fringe_error_um"]
+    assert isinstance(error, dict)
+    return [
+        f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
+        f"fringe error on the screen: {error['as_sent']:.1f} um RMS as sent, "
+        f"{error['corrected']:.1f} um corrected, from the rounding of its levels",
+        "for the configuration (otherwise every start measures both):",
+        "[devices.screen]",
+        f"settle_ms = {report['settle_ms']:.0f}",
+        "linearise = true",
+    ]
+
+
+def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
+    """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as phase."""
+    phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
+    shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
+    wanted = (1 + np.cos(phase + shifts[:, None])) / 2
+    levels = response.levels_of(wanted) if corrected else np.rint(255 * wanted)
+    light = np.interp(levels, response.levels, response.light)
+    seen = np.arctan2(-np.sin(shifts) @ light, np.cos(shifts) @ light)
+    error = np.angle(np.exp(1j * (seen - phase)))
+    return float(mm_per_rad(pattern) * np.std(error))

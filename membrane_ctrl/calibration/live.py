@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.calibration import plan
 from membrane_ctrl.calibration import session as sessions
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
@@ -71,8 +70,8 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
             head, missing = session.head, session.missing
             _same_bench(link, session)
         else:
-            reach, sets = plan.reach_of(held, link.config), options.sets or USUAL_SETS
-            wanted = plan.setpoints_um(held, reach, options.range_um, sets)
+            reach, sets = sessions.reach_of(held, link.config), options.sets or USUAL_SETS
+            wanted = sessions.setpoints_um(held, reach, options.range_um, sets)
             head = CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
             missing = tuple(range(sets))
         procedure.check(head)
@@ -128,7 +127,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: float) -> str:
+def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
@@ -138,7 +137,7 @@ def _plan(head: CalibrationHead, missing: int, held: plan.HeldMirror, minutes: f
     )
 
 
-def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, options: LiveOptions) -> str:
+def _worth(link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, options: LiveOptions) -> str:
     """How well the sets will determine the geometry, and how much better a wider range would."""
     here = _foreseen(link, held, head.setpoints_um, options)
     line = f"a figure after these sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
@@ -147,7 +146,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, opti
         return line
     ends = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2, (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
-    reach = plan.reach_of(held, link.config)
+    reach = sessions.reach_of(held, link.config)
     return (
         f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um of range would give {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
@@ -156,7 +155,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: plan.HeldMirror, opti
 
 
 def _foreseen(
-    link: CaptureLink, held: plan.HeldMirror, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: sessions.HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> propagate.Propagated:
     optics = geometry_of_run(link.run_dir, link.config).optics
     solving = options.solving

@@ -9,8 +9,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-from membrane_ctrl.calibration.plan import SETTLE_S, HeldMirror, reach_of, step_s, way_s
-from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
+from membrane_ctrl.calibration.session import (
+    SETTLE_S,
+    CalibrationHead,
+    CalibrationSession,
+    HeldMirror,
+    reach_of,
+    step_s,
+    way_s,
+)
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.model import errors, events, run_events, states, telemetry

@@ -69,7 +69,7 @@ def calibrate_pose(
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
     """Measure settle time and gamma of the screen with the camera."""
-    from membrane_ctrl.calibration.display import calibrate_display as run
+    from membrane_ctrl.calibration.camera import calibrate_display as run
 
     return run(configured(config), str(config), json)
 

@@ -108,7 +108,7 @@ def play(
 
         return list_scenarios()
     terminal.progress("loading the simulated bench")
-    from membrane_ctrl.hold.play import play_scenario
+    from membrane_ctrl.hold.scenario import play_scenario
 
     return play_scenario(scenario, logs, name, real_time)
 

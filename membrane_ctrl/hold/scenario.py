@@ -1,8 +1,11 @@
-"""Scenarios: what happens to a simulated bench and when. One TOML file each (docs/scenarios.md)."""
+"""Scenarios: what happens to a simulated bench and when, one TOML file each (docs/scenarios.md); `twin play`."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import signal
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
@@ -13,9 +16,17 @@ from pydantic import Field, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.console import process, why
+from membrane_ctrl.controller import tick
 from membrane_ctrl.controller.commands import Command, Kind
+from membrane_ctrl.hold import scenario, scenarios, start
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
+from membrane_ctrl.processes import child, ring
+from membrane_ctrl.recorder.process import prepare_rerun
+from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.sim import bench_events, plant, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
@@ -159,3 +170,108 @@ def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
 def _switch(name: str, value: Any) -> Callable[[virtual_bench.VirtualBench], None]:
     kind = type(_SWITCHES[name])
     return lambda bench: setattr(bench.wrong, name, kind(value))
+
+
+_ROUND_S = 20.0  # of the run, between two rounds of the recorder
+_LIVE_ROUND_S = 1.0  # in real time, so that others can follow
+_MESSAGES_A_TICK = 4  # at most
+_CONSOLE_STOPS_S = 3.0
+
+
+def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) -> int:
+    """Play a scenario, given its name or its file, and record it as a run in `logs_dir`.
+
+    Raises InputError for an unknown or invalid scenario, DeviceError if the folder cannot be written.
+    """
+    path = scenarios.find_scenario(word)
+    played = scenario.load_scenario(path, scenario.Scenario)
+    name = name or path.stem
+    # a stranger's file decides neither where runs are stored nor which are deleted
+    config = played.config.model_copy(update={"recording": RecordingConfig()})
+    with contextlib.ExitStack() as stack:
+        addresses = {n: stack.enter_context(ring.ring(*size)) for n, size in _sizes(config).items()}
+        writers = {n: stack.enter_context(contextlib.closing(ring.RingWriter(a))) for n, a in addresses.items()}
+        run = scenario.ScenarioRun(played.model_copy(update={"config": config}), writers)
+        run_dir = create_run_folder(logs_dir, name, run.virtual.clock.origin_utc, config)
+        terminal.progress(f"playing {why.duration(played.duration_s)} of: {played.title}")
+        ticks: scenario.Ticks = run.ticks()
+        if real_time:
+            real = clock.RunClock.start()
+            ticks = _paced(run, ticks, real)
+            rows, events, shapes = (addresses[n] for n in ("telemetry", "events", "shapes"))
+            _show(process.ConsoleSpec(real, rows, events, shapes, run_dir, config, played.duration_s), stack)
+        else:
+            ticks = terminal.counted(ticks, "playing", round(played.duration_s * config.loop.rate_hz))
+        with _stopped_by_signals(run):
+            _record(run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S)
+    start.report(run_dir, as_json=False)
+    return errors.Exit.INTERRUPTED if run.stopped else errors.Exit.DONE
+
+
+def _sizes(config: Config) -> dict[str, tuple[int, int]]:
+    """Slots of the rings for two rounds, and bytes of each."""
+    ticks = round(2 * _ROUND_S * config.loop.rate_hz)
+    return {
+        "telemetry": (ticks, telemetry.ROW_BYTES),
+        "inputs": (_MESSAGES_A_TICK * ticks, tick.MESSAGE_BYTES),
+        "events": (4096, 4096),
+        "shapes": (256, 1 << 16),
+    }
+
+
+def _record(
+    run: scenario.ScenarioRun,
+    ticks: scenario.Ticks,
+    run_dir: Path,
+    name: str,
+    addresses: dict[str, ring.RingAddress],
+    round_s: float,
+) -> None:
+    """Run all ticks and record them, in this process: virtual time waits for the disk."""
+    prepare_rerun()
+    from membrane_ctrl.recorder import recorder, sink
+
+    virtual, config = run.virtual, run.config
+    recorded = ("inputs", "events", "shapes")
+    with contextlib.ExitStack() as stack:
+        readers = {n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n]))) for n in recorded}
+        recording = sink.Recording(run_dir, name, virtual.clock, config)
+        files = recorder.Recorder(run_dir, virtual.clock, config, readers, recording, None, virtual.tell)
+        virtual.tell(run_events.Started("the twin in virtual time", "ordinary", ""))
+        due_s = round_s
+        for _ in ticks:
+            if virtual.now_s >= due_s:
+                due_s += round_s
+                files.drain()
+                files.write()
+        virtual.end()
+        files.finish()
+
+
+def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks, real: clock.RunClock) -> scenario.Ticks:
+    """The ticks, each at its time; late ones follow at once."""
+    for each in ticks:
+        time.sleep(max(0.0, run.virtual.now_s - real.now()))
+        yield each
+
+
+def _show(spec: process.ConsoleSpec, stack: contextlib.ExitStack) -> None:
+    """Start a console, which ends with the "end" event; the stack waits for it."""
+    screen = child.Child("screen", "membrane_ctrl.console.process:console_main", (spec,), nice=5)
+    stack.callback(screen.stop, 0.0)
+    stack.callback(screen.join, _CONSOLE_STOPS_S)
+    screen.start()
+
+
+@contextlib.contextmanager
+def _stopped_by_signals(run: scenario.ScenarioRun) -> Iterator[None]:
+    """Within this context, Ctrl-C, SIGTERM and a closed terminal end the run at its next tick."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    for number, handler in before.items():
+        if handler != signal.SIG_IGN:
+            signal.signal(number, lambda found, frame: run.stop(signal.Signals(found).name))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -10,7 +10,7 @@ from test_acquisition_display_test import HEIGHT_PX, WIDTH_PX, Bench
 
 from firmware_iface.display import RAMP_LEVELS, measured_response
 from membrane_ctrl.acquisition.optical_bench import OpticalBench
-from membrane_ctrl.calibration.display import fringe_error_mm, lines_of, measured, report_of
+from membrane_ctrl.calibration.camera import fringe_error_mm, lines_of, measured, report_of
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology.phase import mm_per_rad

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from live_bench import config
 
-from membrane_ctrl.calibration.plan import HeldMirror, Reach, reach_of, setpoints_um, way_s
+from membrane_ctrl.calibration.session import HeldMirror, Reach, reach_of, setpoints_um, way_s
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import InputError
 

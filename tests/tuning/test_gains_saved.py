@@ -15,7 +15,8 @@ from membrane_ctrl.sessions import folder as plain
 from tuning import choice
 from tuning.gains_file import entries, entry, note
 from tuning.identification.pump_survey import PumpMap
-from tuning.session import MappedPump, Verified
+from tuning.pump_trial import MappedPump
+from tuning.session import Verified
 
 BEFORE = LoopConfig()
 GAINS = {"kp_per_s": 0.448, "ti_s": 8.79, "measurement_filter_s": 0.1, "temperature_gain_um_per_k": 121.5}

@@ -18,12 +18,12 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
 from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import command as tune
-from tuning import session
+from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
 from tuning.identification.pump_curve import Level, PumpRun, fit
 from tuning.identification.pump_survey import PumpMap
+from tuning.opening import TwinHold
 from tuning.rig import HoldRig
-from tuning.twin_hold import TwinHold
 
 DT_S = 0.1
 
@@ -78,7 +78,7 @@ def started(tmp_path: Path, plant: ForeignPlant, **loop: float) -> tuple[TwinHol
 def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
     """A session's pump map."""
     link, rig, folder = started(tmp_path, plant)
-    done, folder = session.map_pump(folder, rig)
+    done, folder = pump_trial.map_pump(folder, rig)
     assert (folder.head.before, folder.config.pump) == (rig.loop, done.found.pump)
     return done.found, link
 
@@ -134,7 +134,7 @@ class ForeignHold(TwinHold):
 
 def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     """Exit code of `tune` on that hold."""
-    monkeypatch.setattr(tune.twin_hold, "TwinHold", ForeignHold)
+    monkeypatch.setattr(tune.opening, "TwinHold", ForeignHold)
     config = tmp_path / "foreign.toml"
     config.write_text(dump(foreign_config(rate_hz=20.0)))
     return run(["tune", *words, "--twin", "--config", str(config), "--logs", str(tmp_path)])
@@ -172,18 +172,18 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
     )
     full = 5.0 * strength
     wrong = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full)
-    monkeypatch.setattr(session, "_surveyed", lambda rig, limit_um: flat_map(wrong))
+    monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(wrong))
     before = rig.loop, rig.pump
     if strength == 1.0:
-        done, _ = session.map_pump(folder, rig)
+        done, _ = pump_trial.map_pump(folder, rig)
         assert done.gain == pytest.approx(1.0, abs=0.1)
         assert done.before == before[1]
         assert rig.pump == wrong
     else:
         with pytest.raises(RejectedError, match=r"steps of the flow contradict the curve .* run `tune pump` again"):
-            session.map_pump(folder, rig)
+            pump_trial.map_pump(folder, rig)
         assert (rig.loop, rig.pump) == before
-        assert not session.mapped(folder)
+        assert not pump_trial.mapped(folder)
         assert open_session(folder.path).config == link.config
     rig.hold(40.0)
     assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])
@@ -192,8 +192,8 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
 def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
     loop = LoopConfig(feedforward_barometer=False)
     quick, late = flat_map(PumpConfig()), replace(flat_map(PumpConfig()), delay_s=1.2, lag_s=0.3)
-    assert session._safe(loop, quick) == loop
-    safe = session._safe(loop, late)
+    assert pump_trial._safe(loop, quick) == loop
+    safe = pump_trial._safe(loop, late)
     model = PlantModel(1.0, 1.2, 0.3, 1.24)
     assert margins(Gains.of(safe), model, 0.02).ms < 1.75
     assert not margins(Gains.of(loop), model, 0.02).ms < 1.75

@@ -16,8 +16,8 @@ from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.plant import BenchEvent
 from tuning import session
 from tuning.identification.characterise import characterise, spec_of
+from tuning.opening import TwinHold
 from tuning.rig import HoldRig
-from tuning.twin_hold import TwinHold
 
 
 def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:

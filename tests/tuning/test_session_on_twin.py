@@ -26,10 +26,10 @@ from tuning import session
 from tuning.choice import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
+from tuning.opening import TwinHold
 from tuning.proposal.design import NAMES
 from tuning.proposal.trade import against
 from tuning.rig import HoldRig
-from tuning.twin_hold import TwinHold
 
 CONFIG = """
 [twin]
@@ -290,7 +290,7 @@ class Kept(TwinHold):
 def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
     done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, after_s: float
 ) -> None:
-    class Interrupted(tune.Progress):
+    class Interrupted(tune.opening.Progress):
         heard_s = 0.0
 
         def __call__(self, seconds: float) -> None:
@@ -298,8 +298,8 @@ def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
             self.interrupted = self.interrupted or after_s < self.heard_s < after_s + 0.05
             super().__call__(seconds)
 
-    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
-    monkeypatch.setattr(tune, "Progress", Interrupted)
+    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
+    monkeypatch.setattr(tune.opening, "Progress", Interrupted)
     code = tune_twin(tmp_path, step, "--session", str(done.path), *TIMES)
     assert code == Exit.INTERRUPTED
     for _ in range(20):
@@ -317,7 +317,7 @@ def test_history_rollback_and_comparison(
 ) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
+    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
     assert tune_twin(copied, "rollback", "--reason", "did not like it") == Exit.DONE
     assert [line.what for line in journal.entries(copied)] == ["kept", "rolled_back"]
     assert tune_twin(copied, "rollback") == Exit.BAD_INPUT
@@ -343,7 +343,7 @@ def test_a_comparison_crosses_gains_and_benches(done: SessionFolder, tmp_path: P
 def test_rolling_back_sets_the_gains_of_before(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
+    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
     config = CONFIG + "kp_per_s = 0.3\n"
     assert tune_twin(copied, "rollback", config=config) == Exit.DONE
     for _ in range(12):
@@ -369,7 +369,7 @@ def asked(
 ) -> tuple[int, float]:
     """Exit code of `tune apply` answered so, and the gain that then holds the mirror."""
     monkeypatch.setattr(sys, "stdin", Terminal(answers))
-    monkeypatch.setattr(tune.twin_hold, "TwinHold", Kept)
+    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
     done.begin("apply")
     code = tune_twin(tmp_path, "apply", "--session", str(done.path), *words)
     for _ in range(20):

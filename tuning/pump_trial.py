@@ -1,0 +1,134 @@
+"""The measured curve of the pump on trial: measured, applied, checked by steps of the flow, kept or taken back."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from membrane_ctrl.config import schema
+from membrane_ctrl.control import gas
+from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.model import errors, states, telemetry
+from membrane_ctrl.sessions import folder
+from tuning.gains_file import MS_MAX
+from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey, records
+from tuning.rig import HoldRig
+
+_MAP_S = 3600.0
+# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer.
+_CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0}
+_BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
+_DARK_MOST = 3  # experiments in a row that a lost laser ended
+_CHECK_BEFORE_S, _CHECK_S, _CHECK_AFTER_S = 40.0, 120.0, 15.0
+_CURVE_OFF = 0.2  # of k; the margins tolerate more
+
+
+@dataclass(frozen=True, slots=True)
+class MappedPump:
+    """`pump_map.json`: what was measured and applied, and what the pump was taken for before."""
+
+    found: pump_survey.PumpMap
+    before: schema.PumpConfig
+    gain: float  # of the mirror on the curve, from steps of the flow: 1
+    gain_sigma: float
+
+
+def mapped(session: folder.SessionFolder) -> bool:
+    """Whether the session is based on a curve that it has measured."""
+    return session.file("pump_map.json").exists()
+
+
+def mapped_of(session: folder.SessionFolder) -> MappedPump:
+    """Result of the pump map."""
+    return folder.read(session.file("pump_map.json"), MappedPump)
+
+
+def map_pump(
+    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0
+) -> tuple[MappedPump, folder.SessionFolder]:
+    """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
+
+    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones
+    that do. Raises RejectedError with what to do if there is no curve, or the steps contradict it; the former curve
+    and gains are then in force.
+    """
+    before = rig.pump
+    rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
+    try:
+        found = _surveyed(rig, limit_um)
+        found = replace(found, pump=found.pump.model_copy(update={"probe_um": before.probe_um}))
+        loop = _safe(rig.good[0], found)
+        rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
+        gain, sigma = _checked(rig)
+    except (characterise.ExperimentError, ValueError) as error:
+        rig.go_back()
+        raise errors.RejectedError(f"pump map: {error}") from None
+    rig.keep()
+    rig.good = loop, found.pump
+    session = folder.based_on(session, loop, found.pump)
+    done = MappedPump(found, before, gain, sigma)
+    folder.write(session.file("pump_map.json"), done)
+    return done, session
+
+
+def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
+    around = rig.around(_returned(rig), limit_um)
+    holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
+    survey = pump_survey.PumpSurvey(holding, around.limit_um)
+    while steps := survey.steps():
+        spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
+        rows, finished = rig.performed(spec)
+        survey.take(run_of(rows, rig.dt_s), finished.completed)
+        if survey.dark >= _DARK_MOST:
+            raise ValueError(finished.reason)
+        _returned(rig)
+    return survey.result()
+
+
+def _safe(loop: schema.LoopConfig, found: pump_survey.PumpMap) -> schema.LoopConfig:
+    """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this actuator."""
+    model = loop_model.PlantModel(1.0, found.delay_s, found.lag_s, found.leak_um_per_s)
+    margins = loop_model.margins(loop_model.Gains.of(loop), model, 1 / loop.rate_hz)
+    if margins.stable and margins.ms <= MS_MAX:
+        return loop
+    late_s = found.delay_s + found.lag_s + loop.measurement_filter_s + 0.5 / loop.rate_hz
+    return loop.model_copy(update={"kp_per_s": 0.5 / late_s, "ti_s": 8 * late_s, "td_s": 0.0})
+
+
+def _checked(rig: HoldRig) -> tuple[float, float]:
+    """The gain of the mirror on the curve in force, and its error, from steps of the flow.
+
+    Raises ValueError if it is far from 1, or differs above and below the holding flow.
+    """
+    _returned(rig)
+    rig.hold(_CHECK_AFTER_S)
+    around = rig.around(rig.hold(_CHECK_BEFORE_S))
+    machine.room(around)
+    record, _ = rig.perform(characterise.spec_of("steps", around, _CHECK_S))
+    found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))
+    gain, sigma = found.model.gain, found.sigma.gain
+    if characterise.judge(record, found).pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma):
+        raise ValueError(
+            f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
+            "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
+        )
+    return gain, sigma
+
+
+def _returned(rig: HoldRig) -> records.Record:
+    """Hold until the mirror is back at the setpoint, or three minutes at most."""
+    for _ in range(_BACK_MOST):
+        record, setpoint_um = rig.hold_about(_BACK_S)
+        off_um = np.abs(record.filled_displacement_um() - setpoint_um).reshape(6, -1).mean(axis=1)
+        if off_um[3:].max() < _BACK_WITHIN_UM:
+            break
+    return record
+
+
+def run_of(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_curve.PumpRun:
+    """The ticks of an experiment with pump commands; the hold before and after it does not count."""
+    tune = [row for row in rows if row.state == states.State.TUNE][1:]  # the first still has the loop's command
+    columns = (
+        [getattr(row, name) for row in tune] for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")
+    )
+    return pump_curve.PumpRun(dt_s, *(np.array(column, dtype=float) for column in columns))
