@@ -18,7 +18,8 @@ def _pictures(notebook: nbformat.NotebookNode) -> int:
     return json.dumps(notebook).count('"image/png"')
 
 
-@pytest.mark.parametrize("name", ["measure", "library", "review", pytest.param("tune", marks=pytest.mark.campaign)])
+@pytest.mark.campaign  # half a minute each; CI runs them
+@pytest.mark.parametrize("name", NAMES)
 def test_a_notebook_shows_what_is_stored_in_it(name: str, tmp_path: Path) -> None:
     stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     fresh = executed(name, tmp_path)

@@ -78,6 +78,7 @@ def gauge(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return made
 
 
+@pytest.mark.campaign  # runs pytest and the linter; CI runs it
 def test_what_is_written_passes_its_own_tests_and_the_linter(tmp_path: Path) -> None:
     """For each kind of role, and for names whose lines are short and long."""
     names = {"displacement": "an_instrument_of_a_longer_name", "barometer": "b2", "vent": "v"}

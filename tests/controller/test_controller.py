@@ -217,6 +217,7 @@ def test_a_mirror_that_cannot_follow_is_given_up() -> None:
     assert [f["name"] for f in run.of("fault")] == ["following_error"]
 
 
+@pytest.mark.campaign
 def test_a_flat_mirror_is_filled_in_hours_and_held() -> None:
     twin = TwinConfig(scenario="calm", laser_noise_um=0.3, from_flat=True)
     loop = LoopConfig(rate_hz=2.0, measurement_filter_s=0.25)

@@ -91,6 +91,7 @@ def worst_share(found: PumpMap, pump: ForeignPump) -> float:
     return max(abs(curve._rising.flow(d) - pump.settled(d)) for d in commands) / pump.full_um_per_s
 
 
+@pytest.mark.campaign
 def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
     """It stopped both the relay's fit ("stalls at small flows") and the former map ("too tight, or no pump")."""
     pump = ForeignPump("quadratic", 7.0, 0.9, 0.3, start=0.2, stall=0.2)
