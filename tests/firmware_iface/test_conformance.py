@@ -239,7 +239,7 @@ async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -
     wire = PtyWire(RtuBusEmulator(settings, {1: partial(respond, table=board.state)}), tmp_path / "tty")
     wire.plug()
     try:
-        findings = await examine(f"rtu://{tmp_path}/tty?baud=115200&parity=E")
+        findings = await examine(f"rtu://{tmp_path}/tty?baud=115200&parity=E", timeout_s=4.0)
     finally:
         wire.unplug()
         await board.stop()
