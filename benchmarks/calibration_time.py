@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.calibration.sets import problem_of, read_sets
+from membrane_ctrl.calibration.sets import CalibrateOptions, problem_of, read_sets
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibrate.solve import solve
 from membrane_ctrl.sim.optics.film_shape import typical_film
@@ -40,7 +40,8 @@ def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:
         seconds = processors = 0.0
         for _ in range(2):  # the first compiles
             begin, busy = time.perf_counter(), time.process_time()
-            solve(problem_of(read_sets(folders, None), {}, 1.0))
+            options = CalibrateOptions(folders, None, Path(), (), 1.0, False)
+            solve(problem_of(read_sets(folders, None), {}, options))
             seconds, processors = time.perf_counter() - begin, time.process_time() - busy
     what = f"{count} {'full-resolution sets' if shrink == 1 else 'sets of a quarter of the resolution'}"
     return [

@@ -1,6 +1,7 @@
 """Results of a calibration, as a table for JSON and as lines for people."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def report_of(
         return table
     middle = len(solution.states) // 2
     claim = propagate.propagate(solution, middle, analysis_radius_mm)
-    scale = diagnose.laser_scale(solution)
+    scale, advice = diagnose.laser_scale(solution), propagate.advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
         "condition": propagate.condition_number(solution),
@@ -45,6 +46,9 @@ def report_of(
             "sag_um": claim.sag_um,
             "zernike_um": claim.zernike_um.tolist(),
         },
+        "advice": None if advice is None else asdict(advice),
+        "film": solution.problem.references.film,
+        "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},
         "sets": _sets(solution),
     }
@@ -102,6 +106,10 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} um RMS"
     )
+    if (advice := report["advice"]) is not None:
+        unit = parameters.ALL[parameters.NAMES.index(advice["name"])].unit
+        known = f"{advice['sigma']:.2g} {unit}".strip()
+        lines.append(f"best next: {advice['name']} known to {known} would give sag +- {advice['sag_um']:.2g} um")
     if report["laser"]["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")

@@ -16,15 +16,17 @@ import tomli_w
 from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
-from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
-from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, separable, verdict
+from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, ring_pose, separable, verdict
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.calibrate.rim import RADIUS_SIGMA_MM, Rim
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
 from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
@@ -54,6 +56,18 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
     )
 
 
+def edges_of(figure: SetFigure) -> FloatArray | None:
+    """Edges of the light at the rim (2, n) in a full set; None where they are not seen."""
+    stack, names = figure.checked.stack, [pattern.name for pattern in figure.head.patterns]
+    bad = {flag.frame for flag in figure.checked.flags} | set(stack.unusable)
+    if not {"white", "black"} <= {name for k, name in enumerate(names) if k not in bad}:
+        return None
+    white, black = (stack.frames[names.index(name)].astype(float) for name in ("white", "black"))
+    rim_z_mm = figure.checked.tracer.vertex_z_mm + figure.figure.fit.surface.sag_mm
+    radius_mm = figure.head.optics.mirror.radius_mm
+    return ring_pose.find_edges(white - black, figure.checked.tracer.geometry, radius_mm, rim_z_mm)
+
+
 @dataclass(frozen=True)
 class CalibrateOptions:
     """Options of the command."""
@@ -68,6 +82,8 @@ class CalibrateOptions:
     # Laser reading at which the manual measurements hold, if the sets do not state it; None: the first set's
     reference_um: float | None = None
     priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
+    film: separable.FilmModel = "free"
+    radius_sigma_mm: float = RADIUS_SIGMA_MM  # of the ring, whose edge is seen
 
 
 @dataclass(frozen=True)
@@ -78,6 +94,7 @@ class Bundle:
     optics: OpticsConfig
     reference_um: float
     notes: tuple[str, ...] = ()
+    edges_px: tuple[FloatArray, ...] = ()  # of the rim, in the sets that show it
 
 
 def calibrate_command(options: CalibrateOptions) -> int:
@@ -87,7 +104,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     begin = time.perf_counter()
     bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
     read = time.perf_counter()
-    problem = problem_of(bundle, free, options.laser_sigma_um)
+    problem = problem_of(bundle, free, options)
     findings, solution = verdict.before(problem), None
     if not findings:
         try:
@@ -139,18 +156,23 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
     notes: list[str] = []
+    edges: list[FloatArray] = []
     for folder in terminal.counted(folders, "sets"):
         figure = figures.of(folder)
         benches.append(figure.head.optics)
         _same_rig(folders[0], benches[0], folder, benches[-1])
         sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
+        if (seen := edges_of(figure)) is not None:
+            edges.append(seen)
         files = figure.head.files
         notes += [f"{folder.name}: {files[flag.frame]} omitted: {flag.reason}" for flag in figure.checked.flags]
     reference_um = _reference_um(sets, benches, reference_um)
     if not any(math.isfinite(phases.displacement_um) for phases in sets):
         # no laser: the world's origin is the vertex of the first set
         sets[0] = replace(sets[0], displacement_um=reference_um)
-    return Bundle(tuple(sets), benches[0], reference_um, tuple(notes))
+    if not edges:
+        notes.append("the rim is not seen in any full set: its size is not used")
+    return Bundle(tuple(sets), benches[0], reference_um, tuple(notes), tuple(edges))
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
@@ -196,17 +218,19 @@ def stated_sigmas(optics: OpticsConfig) -> dict[str, float]:
     return spread_file.sigmas_of(optics) | {name: sigma for name, sigma in given.items() if sigma is not None}
 
 
-def problem_of(bundle: Bundle, free: dict[str, float], laser_sigma_um: float) -> Problem:
+def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions) -> Problem:
     """The stated bench with its sigmas. Raises InputError if the geometry cannot be calibrated."""
     own = stated_sigmas(bundle.optics)
     try:
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise errors.InputError(str(error)) from None
-    references = separable.References(bundle.reference_um, laser_sigma_um)
+    references = separable.References(bundle.reference_um, options.laser_sigma_um, film=options.film)
+    radius_mm = bundle.optics.mirror.radius_mm
     if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
         own[LASER.name] = 0.0  # no readings to scale
-    return Problem(geometry, bundle.sets, sigmas({**own, **free}), references, bundle.optics.mirror.radius_mm)
+    rim = Rim.of(bundle.edges_px, radius_mm, options.radius_sigma_mm)
+    return Problem(geometry, bundle.sets, sigmas({**own, **free}), references, radius_mm, rim)
 
 
 def _write(

@@ -1,13 +1,14 @@
 """The commands that calibrate the optics."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, PriorOption, SetArgument, configured
 from membrane_ctrl.model.errors import InputError
 
+FilmModel = Literal["free", "hencky", "prestressed"]
 BoardOption = Annotated[
     str, typer.Option(help="Board, as KIND:COLUMNSxROWS in squares; KIND is charuco or chessboard.")
 ]
@@ -91,6 +92,12 @@ def calibrate(
     laser_sigma_um: Annotated[
         float, typer.Option(min=0.001, help="Standard uncertainty of a set's mean laser reading, um.")
     ] = 1.0,
+    film: Annotated[
+        FilmModel, typer.Option(help="What the film follows: nothing (free), the law with any pre-strain, or Hencky.")
+    ] = "free",
+    radius_sigma_mm: Annotated[
+        float, typer.Option(min=0.001, help="Standard uncertainty of the ring's radius, whose edge is seen, mm.")
+    ] = 0.2,
     pictures: Annotated[bool, typer.Option(help="Draw the residuals next to the geometry file.")] = True,
     json: JsonOption = False,
     live: Annotated[bool, typer.Option("--live", help="Take the sets from a hold; ask before it moves.")] = False,
@@ -111,7 +118,7 @@ def calibrate(
 
     solving = CalibrateOptions(
         folders or (), geometry, out or Path("geometry.toml"), free or (), laser_sigma_um, json, pictures,
-        priors=prior or (),
+        priors=prior or (), film=film, radius_sigma_mm=radius_sigma_mm,
     )  # fmt: skip
     if not live:
         if not folders:

@@ -180,7 +180,7 @@ class Tracer:
 
     def intersect(self, points: Points, surface: Surface, newton: int = 1) -> None:
         """Put the points on a surface, from where they are, by Newton steps."""
-        shape = self._shape(surface)
+        shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
 
         def run(start: int, stop: int) -> None:
             kernels.intersect(points.rays, points.t_mm, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)

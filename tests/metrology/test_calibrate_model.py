@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calibration_truth import OPTICS, STATED, make
@@ -55,6 +57,10 @@ def test_derivatives_are_those_of_the_model() -> None:
             numeric = (both[0] - both[1]) / 2e-3
         elif column == PARAMETERS:
             numeric = (predicted(z=z_mm + 1e-2) - predicted(z=z_mm - 1e-2)) / 2e-2
+        elif column < LOCAL:
+            steps = [np.eye(LOCAL)[column, PARAMETERS + 1 :] * size for size in (1e-5, -1e-5)]
+            both = [predicted(surface=replace(SURFACE, beyond_mm=tuple(step.tolist()))) for step in steps]
+            numeric = (both[0] - both[1]) / 2e-5
         else:
             step = np.zeros(len(NAMES))
             step[column - LOCAL] = 1e-2 * ALL[column - LOCAL].sigma

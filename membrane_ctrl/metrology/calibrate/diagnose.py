@@ -17,6 +17,8 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray
 SURE = 1e-6  # probability that good data look as bad
 _CAMERA = tuple(parameters.NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
 _CAMERA_SIGMA_DEG = 1.0  # of a bump: a hand on the mount
+_CREEP_SIGMA_MM = 1.0
+_LEAST_TO_CREEP = 3  # sets
 _LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
 
 
@@ -65,6 +67,21 @@ class CameraBump:
 
 
 @dataclass(frozen=True)
+class Creep:
+    """Camera or screen moved evenly from the first set to the last."""
+
+    name: str  # of the parameter that explains most of it alone
+    amount: float  # by which that one changed
+    fall: float
+    freedom: int
+
+    @property
+    def sure(self) -> bool:
+        """As for `Suspect`."""
+        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+
+
+@dataclass(frozen=True)
 class LeftOut:
     """One set against the geometry of all others."""
 
@@ -90,8 +107,8 @@ def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
         k = parameters.NAMES.index(name)
         freed = solution.problem.sigmas.copy()
         freed[k] = parameters.usual_sigma(name)
-        moved = solve.step(sums + solve.prior(freed, solution.common), freed)
-        fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
+        moved = solve.step(sums + solution.known(freed), freed)
+        fall = _squares(sums, solution) - moved.squares
         sigma = float(np.sqrt(moved.covariance[k, k]))
         figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: parameters.OPTICAL])))
         out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
@@ -104,15 +121,15 @@ def laser_scale(solution: solve.Solution) -> LaserScale:
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
     sums = np.sum(_reduced(solution), axis=0)
-    moved = solve.step(sums + solve.prior(free, solution.common), free)
-    fall = _squares(sums, solution.problem.sigmas, solution.common) - moved.squares
+    moved = solve.step(sums + solution.known(free), free)
+    fall = _squares(sums, solution) - moved.squares
     return LaserScale(1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall)
 
 
 def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
     """Each set against the others."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
-    own = solve.prior(sigmas, solution.common)
+    own = solution.known(sigmas)
     everything = solve.step(np.sum(reduced, axis=0) + own, sigmas).squares
     out = []
     for k, this in enumerate(reduced):
@@ -125,22 +142,43 @@ def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
 
 def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
     """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
-    reduced, sigmas = _reduced(solution), solution.problem.sigmas
-    count = len(reduced)
-    before = _squares(np.sum(reduced, axis=0), sigmas, solution.common)
+    count = len(solution.states)
     groups = {(k,) for k in range(count)} | {tuple(range(k, count)) for k in range(1, count)}
     out = []
     for group in sorted(groups):
-        sums = np.sum([_with_bump(each, k in group) for k, each in enumerate(reduced)], axis=0)
-        known = _with_bump(solve.prior(sigmas, solution.common), False)
-        extra = np.arange(separable.COMMON, separable.COMMON + len(_CAMERA))
-        known[extra, extra] += 1 / _CAMERA_SIGMA_DEG**2
-        ring = separable.COMMON - len(parameters.NAMES)
-        kept = np.append(sigmas > 0, np.ones(ring + len(_CAMERA), bool))
-        delta, squares = _solved(sums + known, np.flatnonzero(kept))
-        yaw, pitch, roll = (float(v) for v in delta[-len(_CAMERA) :])
-        out.append(CameraBump(group, (yaw, pitch, roll), before - squares))
+        share = np.isin(np.arange(count), group).astype(float)
+        amounts, fall = _moved_by(solution, _CAMERA, share, np.full(len(_CAMERA), _CAMERA_SIGMA_DEG))
+        yaw, pitch, roll = amounts
+        out.append(CameraBump(group, (yaw, pitch, roll), fall))
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
+
+
+def creep(solution: solve.Solution) -> Creep | None:
+    """Whether camera or screen crept from the first set to the last, and what changed most; None if not sure."""
+    count, poses = len(solution.states), tuple(range(len(parameters.POSE)))
+    if count < _LEAST_TO_CREEP:
+        return None
+    share = np.linspace(-0.5, 0.5, count)
+    sigmas = np.array([_CAMERA_SIGMA_DEG if p.unit == "deg" else _CREEP_SIGMA_MM for p in parameters.POSE])
+    whole = _moved_by(solution, poses, share, sigmas)[1]
+    single = [_moved_by(solution, (k,), share, sigmas[[k]]) for k in poses]
+    most = max(poses, key=lambda k: single[k][1])
+    found = Creep(parameters.NAMES[most], single[most][0][0], whole, len(poses))
+    return found if found.sure else None
+
+
+def _moved_by(
+    solution: solve.Solution, columns: tuple[int, ...], share: FloatArray, sigmas: FloatArray
+) -> tuple[tuple[float, ...], float]:
+    """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of squares."""
+    reduced, hand = _reduced(solution), solution.problem.sigmas
+    sums = np.sum([_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0)
+    known = _with_more(solution.known(hand), columns, 0.0)
+    extra = np.arange(separable.COMMON, separable.COMMON + len(columns))
+    known[extra, extra] += 1 / sigmas**2
+    kept = np.append(hand > 0, np.ones(separable.COMMON - len(parameters.NAMES) + len(columns), bool))
+    delta, squares = _solved(sums + known, np.flatnonzero(kept))
+    return tuple(delta[-len(columns) :].tolist()), _squares(np.sum(reduced, axis=0), solution) - squares
 
 
 def without(solution: solve.Solution, index: int) -> solve.Solution:
@@ -149,9 +187,7 @@ def without(solution: solve.Solution, index: int) -> solve.Solution:
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
-    moved = solve.step(
-        np.sum([each.reduced() for each in linear], axis=0) + solve.prior(sigmas, solution.common), sigmas
-    )
+    moved = solve.step(np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas)
     common = solution.common + moved.delta
     return replace(
         solution,
@@ -168,8 +204,18 @@ def _reduced(solution: solve.Solution) -> list[FloatArray]:
     return [each.reduced() for each in solution.equations]
 
 
-def _squares(sums: FloatArray, sigmas: FloatArray, common: FloatArray) -> float:
-    return solve.step(sums + solve.prior(sigmas, common), sigmas).squares
+def film_rise(solution: solve.Solution, film: separable.FilmModel) -> float:
+    """By how much the sum of squares of a solution with a free film rises if the film is like that."""
+    bound = []
+    for each, state in zip(solution.equations, solution.states, strict=True):
+        rows = separable.film_rows(state.surface, film)
+        bound.append(replace(each, sums=each.sums + rows.T @ rows).reduced())
+    return _squares(np.sum(bound, axis=0), solution) - _squares(np.sum(_reduced(solution), axis=0), solution)
+
+
+def _squares(sums: FloatArray, solution: solve.Solution) -> float:
+    sigmas = solution.problem.sigmas
+    return solve.step(sums + solution.known(sigmas), sigmas).squares
 
 
 def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
@@ -183,12 +229,12 @@ def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(np.count_nonzero(good))
 
 
-def _with_bump(sums: FloatArray, bumped: bool) -> FloatArray:
-    """The sums with three more unknowns before the residual; for a bumped set they act as the camera's turns do."""
-    order: Sequence[int] = [*range(separable.COMMON), *_CAMERA, separable.COMMON]
+def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatArray:
+    """The sums with more unknowns before the residual, which act as some of the parameters do, times a share."""
+    order: Sequence[int] = [*range(separable.COMMON), *columns, separable.COMMON]
     out = sums[np.ix_(order, order)].copy()
-    if not bumped:
-        out[separable.COMMON : -1, :], out[:, separable.COMMON : -1] = 0.0, 0.0
+    out[separable.COMMON : -1, :] *= share
+    out[:, separable.COMMON : -1] *= share
     return np.asarray(out)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve, step
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
 from membrane_ctrl.model.arrays import FloatArray, IntArray
@@ -55,6 +55,35 @@ def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Prop
         sag_um=1e3 * float(np.sqrt(sag @ covariance @ sag)),
         zernike_um=1e3 * np.sqrt(np.diag(to_coeffs @ covariance @ to_coeffs.T)),
     )
+
+
+_BETTER = 5.0  # times: what another instrument may give
+_WORTH = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
+
+
+@dataclass(frozen=True)
+class Advice:
+    """The one hand measurement that would lower the sag's sigma most."""
+
+    name: str
+    sigma: float  # to which it should be known
+    sag_um: float  # 1 sigma then
+
+
+def advice(solution: Solution, index: int) -> Advice | None:
+    """What to measure better, from the equations alone; None if no single number is worth it."""
+    sums, own = np.sum([each.reduced() for each in solution.equations], axis=0), solution.problem.sigmas
+    found = []
+    for k in np.flatnonzero(own > 0):
+        better = own.copy()
+        better[k] /= _BETTER
+        moved = replace(solution, covariance=step(sums + solution.known(better), better).covariance)
+        covariance = surface_covariance(moved, index)
+        sag_um = 1e3 * float(np.sqrt(sag_gradient() @ covariance @ sag_gradient()))
+        found.append(Advice(parameters.NAMES[k], float(better[k]), sag_um))
+    best = min(found, key=lambda each: each.sag_um, default=None)
+    now = float(np.sqrt(sag_gradient() @ surface_covariance(solution, index) @ sag_gradient()))
+    return best if best is not None and best.sag_um < _WORTH * 1e3 * now else None
 
 
 def disc(radius: float) -> tuple[FloatArray, FloatArray]:

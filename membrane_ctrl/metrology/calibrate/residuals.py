@@ -66,7 +66,8 @@ def multiply(table, rows):  # type: ignore[no-untyped-def]
     return out
 
 
-LOCAL = PARAMETERS + 1  # of one set: its surface, and the height of its vertex
+# of one set: its surface's 36, the height of its vertex, and its round terms beyond the 36
+LOCAL = PARAMETERS + 1 + len(film_law.BEYOND)
 COLUMNS = LOCAL + OPTICAL
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
@@ -194,11 +195,12 @@ def _derivatives(
     by_pinhole = by_place - by_height[:, None] * n  # by_place G
     by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
     out = np.empty((2, COLUMNS, d.shape[1]))
-    height, height_x, height_y = basis(m.place[0] / surface.radius_mm, m.place[1] / surface.radius_mm)
-    scale = 1 / surface.radius_mm
+    x, y, scale = m.place[0] / surface.radius_mm, m.place[1] / surface.radius_mm, 1 / surface.radius_mm
+    height, height_x, height_y = (np.vstack(parts) for parts in zip(basis(x, y), round_basis(x, y), strict=True))
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
-        out[axis, :PARAMETERS] = by_height[axis] * height - slope
+        by_terms = by_height[axis] * height - slope
+        out[axis, :PARAMETERS], out[axis, PARAMETERS + 1 : LOCAL] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
     in_camera = geometry.rotation @ d
     for j, turn in enumerate(turns):
@@ -253,6 +255,14 @@ def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     heights = multiply(tables[0], powers) - zernike.at_vertex()[1:, None]
     slopes_x, slopes_y = multiply(tables[1], powers), multiply(tables[2], powers)
     return np.vstack([heights, bowl]), np.vstack([slopes_x, grows * x]), np.vstack([slopes_y, grows * y])
+
+
+def round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights and slopes (k, n) of the terms of `film_law.BEYOND` in radii, each 0 at the vertex."""
+    v, terms = x * x + y * y, film_law.beyond()
+    heights = [series.polyval(v, term) for term in terms]
+    grows = np.array([2 * series.polyval(v, series.polyder(term)) for term in terms])
+    return np.array(heights), grows * x, grows * y
 
 
 def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:

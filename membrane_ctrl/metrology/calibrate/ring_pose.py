@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.calibrate.rim import EDGE_SIGMA_PX, on_rim
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.reconstruct import HeightFunction
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -22,8 +23,6 @@ _POINTS = 720
 _REACH_PX = 8.0  # each way from the rough rim
 _STEP_PX = 0.25
 _LEAST_FOUND = 0.5  # of the rim: less is no ellipse
-# A threshold on a blurred edge is off by the blur's asymmetry, which a whole rim may share
-EDGE_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -88,14 +87,17 @@ def _bench(stated: Geometry, own: FloatArray) -> Geometry:
 
 
 def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> FloatArray:
-    """Distance from the axis at which the rays of the edges meet the rim's height."""
-    rays, z = geometry.rays(*edges), np.zeros(edges.shape[1])
-    x = y = z
-    for _ in range(4):  # the height at the rim hardly changes with the place: each step gains three digits
-        t = (z - geometry.pinhole_mm[2]) / rays[2]
-        x, y = geometry.pinhole_mm[:2, None] + t * rays[:2]
-        z = rim_z(x, y)
-    return np.asarray(np.hypot(x, y))
+    return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
+
+
+def find_edges(light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: float) -> FloatArray | None:
+    """Edges of the light (2, n) at the rim; None if half of it or more is not visible."""
+    outline = find_outline(light, stated, radius_mm, rim_z_mm)
+    try:
+        edges = None if outline is None else rim_edges(light, outline.rim_px)
+    except ValueError:  # no ellipse
+        return None
+    return edges if edges is not None and edges.shape[1] >= _LEAST_FOUND * _POINTS else None
 
 
 def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:

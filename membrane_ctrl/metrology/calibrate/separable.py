@@ -10,18 +10,29 @@ the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has
 vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
+from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 from membrane_ctrl.model.arrays import FloatArray
 
 RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
+# The film as the geometry's witness. Its round terms beyond the 36 are a micrometre of a 37 mm bowl, and a nanometre
+# of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever slackness
+# the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
+FilmModel = Literal["free", "hencky", "prestressed"]
+_FREE_MM, _LAW_MM = 1e-3, 1e-7
+_PATCHES = 12  # across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
+_FEW_IN_PATCH = 4
+_CHANCE = 0.5  # by which patches' variance exceeds single points' without a cause
 _HUBER = 1.9  # of the length of two normal components: keeps 95 % of the efficiency of least squares
 
 
@@ -41,6 +52,7 @@ class References:
     laser_sigma_um: float = 1.0  # of a set's mean reading
     # the clamp creeps by less than a micrometre in the minutes that a calibration takes
     ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
+    film: FilmModel = "free"  # what the film's round terms beyond the 36 are
 
 
 @dataclass(frozen=True)
@@ -49,6 +61,7 @@ class Trust:
 
     weights: FloatArray
     variance: float
+    alike: float = 1.0  # part of the variance from residuals that neighbours share: a pattern
 
     @classmethod
     def full(cls, phases: residuals.SetPhases) -> "Trust":
@@ -62,6 +75,41 @@ class Trust:
         # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not accepted
         variance = max(float(np.median(length) / 1.1774) ** 2, 1.0)
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
+
+
+def less_trust(
+    sets: Sequence[residuals.SetPhases], left_mm: Sequence[FloatArray], trust: Sequence[Trust]
+) -> tuple[Trust, ...]:
+    """Trust in the points of all sets, from their residuals (2, n) at a solution.
+
+    What a film has beyond the model is alike in neighbouring points, and in all sets: it does not average
+    out as noise does. So the means over patches of the picture are compared with what single points let expect,
+    set by set and as sums over the sets; where they scatter more, all points weigh less.
+    """
+    side_px = max(max(np.ptp(p.column_px), np.ptp(p.row_px)) for p in sets) / _PATCHES
+    patches = [_patch_means(*each, side_px) for each in zip(sets, left_mm, trust, strict=True)]
+    together = _scatter(np.sum(patches, axis=0) / np.sqrt(len(patches)))
+    factors = [max(1.0, _scatter(means) - _CHANCE, together - _CHANCE) for means in patches]
+    return tuple(replace(t, variance=t.variance * f, alike=f) for t, f in zip(trust, factors, strict=True))
+
+
+def _patch_means(phases: residuals.SetPhases, left_mm: FloatArray, trust: Trust, side_px: float) -> FloatArray:
+    """Residuals' means over patches in units of their noise, (2, patches, patches); NaN with few points."""
+    column, row = (np.floor(place / side_px).astype(int) for place in (phases.column_px, phases.row_px))
+    count = _PATCHES + 2
+    patch = row % count * count + column % count  # the same in all sets
+    weights = trust.weights / (trust.variance * phases.sigma_mm**2)
+    total = np.bincount(patch, weights, count**2)
+    sums = np.stack([np.bincount(patch, weights * part, count**2) for part in left_mm])
+    full = np.bincount(patch, minlength=count**2) >= _FEW_IN_PATCH
+    return np.where(full, sums / np.sqrt(np.where(full, total, 1.0)), np.nan)
+
+
+def _scatter(means: FloatArray) -> float:
+    """Their variance, as if they were alone: those that the fit has taken are as good as gone."""
+    known = means[np.isfinite(means)]
+    free = known.size - residuals.LOCAL
+    return float(np.sum(known**2) / free) if free > residuals.LOCAL else 1.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +174,7 @@ def _reference_rows(
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
+    ring[0, PARAMETERS + 1 : residuals.LOCAL] = _rim_beyond()
     ring[:, residuals.LOCAL + len(parameters.NAMES) : -1] = -np.eye(RING)
     ring[:, -1] = common[len(parameters.NAMES) :] - rim_of(state)
     ring /= references.ring_sigma_um * 1e-3
@@ -136,14 +185,33 @@ def _reference_rows(
         laser[residuals.LOCAL + parameters.OPTICAL] = moved_mm
         laser[-1] = -(1 + common[parameters.OPTICAL]) * moved_mm - state.vertex_z_mm
         laser /= references.laser_sigma_um * 1e-3
-    return rows
+    return np.vstack([rows, film_rows(state.surface, references.film)])
+
+
+def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
+    """What the film says of the terms beyond the 36, as weighted rows [derivatives, miss]."""
+    rows = np.zeros((len(film_law.BEYOND), residuals.LOCAL + COMMON + 1))
+    rows[:, PARAMETERS + 1 : residuals.LOCAL] = np.eye(len(film_law.BEYOND))
+    rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * len(film_law.BEYOND))
+    if film == "prestressed":
+        excess_mm, step_mm = surface.parameters[-1], 1e-5
+        here, there = (film_law.beyond_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
+        rows[:, PARAMETERS - 1] = (here - there) / step_mm
+        rows[:, -1] += here
+    return rows / (_FREE_MM if film == "free" else _LAW_MM)
 
 
 def rim_of(state: SetState) -> FloatArray:
     """Harmonics (RING,) of the rim's height in world."""
     out = rim_harmonics() @ state.surface.parameters
-    out[0] += state.vertex_z_mm
+    out[0] += state.vertex_z_mm + (_rim_beyond() @ state.surface.beyond_mm if state.surface.beyond_mm else 0.0)
     return np.asarray(out)
+
+
+@cache
+def _rim_beyond() -> FloatArray:
+    """Height of the rim above the vertex by the round terms beyond the 36."""
+    return np.asarray(film_law.beyond().sum(axis=1))
 
 
 @cache

@@ -7,11 +7,13 @@ import numpy as np
 
 from membrane_ctrl.metrology import reconstruct
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
+from membrane_ctrl.metrology.calibrate.rim import Rim
+from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray
 
-MAX_ITERATIONS = 25
+MAX_ITERATIONS = 40
 _SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
 _NEARLY = 0.1  # likewise: the next step is far below the noise
 _FEW = 4000  # points of a set: a hundred times its unknowns
@@ -29,6 +31,7 @@ class Problem:
     sigmas: FloatArray  # (len(NAMES),): of the hand's measurements; 0 holds a parameter
     references: separable.References  # laser and ring
     radius_mm: float  # of the ring
+    rim: Rim | None = None  # the light's edge, where it is seen
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Solution:
     common: FloatArray  # (COMMON,): parameters and ring
     states: tuple[separable.SetState, ...]  # surface and vertex of each set
     equations: tuple[separable.Equations, ...]  # of each set, at the end
+    at_rim: FloatArray  # (COMMON + 1, squared): the rim's equations
     covariance: FloatArray  # (COMMON, COMMON): of the common unknowns; zeros for what was held
     changes: tuple[float, ...]  # largest change of each step, in standard deviations
     converged: bool  # whether the last step was too small to matter
@@ -48,6 +52,10 @@ class Solution:
     def bench(self) -> parameters.BenchGeometry:
         """The calibrated bench."""
         return parameters.bench_at(self.problem.stated, self.values)
+
+    def known(self, sigmas: FloatArray) -> FloatArray:
+        """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the hand."""
+        return prior(sigmas, self.common) + self.at_rim
 
     @property
     def free(self) -> list[str]:
@@ -118,10 +126,11 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
     trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
-    weighed = False  # whether the step before was the first with new weights
+    weighed = final = near = False  # the step before was the first with new weights; they stay; a solution was near
     while True:
         linear = _linearise(problem, states, common, trust)
-        sums = np.sum([each.reduced() for each in linear], axis=0) + prior(problem.sigmas, common)
+        at_rim = np.zeros((common.size + 1,) * 2) if problem.rim is None else problem.rim.sums(problem.stated, common)
+        sums = np.sum([each.reduced() for each in linear], axis=0) + prior(problem.sigmas, common) + at_rim
         moved = step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(moved.covariance))
         if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
@@ -129,19 +138,26 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
         if progress is not None:
             progress(len(changes), changes[-1])
-        settled = weighed and changes[-1] < _SETTLED
+        settled = (weighed or final) and changes[-1] < _SETTLED
+        left = [each.residual_mm for each in linear]
+        if settled and not final and len(changes) < MAX_ITERATIONS:
+            # not before: far from the solution a wrong bench looks like a film, and both would be believed in turn
+            trust, final, settled = separable.less_trust(problem.sets, left, trust), True, False
+            continue
         if settled or len(changes) == MAX_ITERATIONS:
             values = common[: len(parameters.NAMES)].copy()
-            return Solution(problem, values, common, states, linear, moved.covariance, tuple(changes), settled)
+            return Solution(
+                problem, values, common, states, linear, at_rim, moved.covariance, tuple(changes), settled
+            )
         far = float(np.max(np.abs(moved.delta[: len(parameters.NAMES)][free]) / problem.sigmas[free], initial=0.0))
         delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
         states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
         # Weights are renewed where the steps have nearly converged (at every step, the two may chase each other), and
-        # where points with too much weight lead astray
-        weighed = changes[-1] < _NEARLY or far > _FURTHEST
+        # where points with too much weight lead astray before a solution was near
+        near |= changes[-1] < _NEARLY
+        weighed = not final and (changes[-1] < _NEARLY or (far > _FURTHEST and not near))
         if weighed:
-            left = (each.residual_mm for each in linear)
             trust = tuple(separable.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True))
 
 
@@ -159,6 +175,8 @@ def _linearise(
 def _moved(state: separable.SetState, linear: separable.Equations, common_step: FloatArray) -> separable.SetState:
     own = linear.local_step(common_step)
     surface = Surface.from_parameters(state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm)
+    beyond_mm = np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[PARAMETERS + 1 :]
+    surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
     return separable.SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
 
 

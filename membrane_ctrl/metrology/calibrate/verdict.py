@@ -3,9 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibrate import diagnose, parameters, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, solve
+from membrane_ctrl.metrology.optics import film_law
 
 # Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets 8 mm apart
 LEAST_SPREAD_UM = 1000.0
@@ -58,22 +60,55 @@ def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     One error makes many things look wrong. Of all explanations, the one that removes most from the sum of squares,
     less two for each number it frees (Akaike's rule), is the cause; the others wait until it is gone.
     """
+    film = _film(solution)
     if not solution.converged:
-        return (_astray(solution),)
-    causes = [*_sets(solution), *_laser(solution), *_model(solution)]
+        return (film[0][1] if film else _astray(solution),)
+    causes = [*film, *_sets(solution), *_laser(solution), *_model(solution)]
     cause = [max(causes, key=lambda each: each[0])[1]] if causes else []
-    return (*cause, *_scatter(solution), *_spread(solution))
+    return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
+
+
+def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """A film that is not as the calibration was told, by a solution that knows nothing of it."""
+    told, problem = solution.problem.references.film, solution.problem
+    if told == "free":
+        return []
+    free = replace(problem, references=replace(problem.references, film="free"))
+    try:
+        other = solve(free, start=solution if solution.converged else None)
+    except ValueError:
+        return []
+    freedom = len(film_law.BEYOND) * len(problem.sets)
+    fall = diagnose.film_rise(other, told)
+    if not other.converged or chi2.sf(fall, freedom) > diagnose.SURE:
+        return []
+    name = {
+        "hencky": "Hencky's without pre-strain and nu = 0.3",
+        "prestressed": "of the law, whatever its pre-strain",
+    }
+    says = f"the film's figure is not {name[told]}: use --film free"
+    return [(fall - 2 * freedom, CalibrationFinding(True, says))]
 
 
 def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A bumped camera, a bad set, sets that do not belong together, each with the share that it explains."""
     names = [phases.name for phases in solution.problem.sets]
-    out = []
+    out = [
+        (np.inf, CalibrationFinding(True, f"{names[k]} disagrees with all the others: it is of another bench", (k,)))
+        for k in _of_others(solution)[:1]
+    ]
     for bump in diagnose.bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
         where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
         says = f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
         out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
+    if (crept := diagnose.creep(solution)) is not None:
+        parameter = parameters.ALL[parameters.NAMES.index(crept.name)]
+        says = (
+            f"camera or screen crept from {names[0]} to {names[-1]}, as if by {crept.amount:+.2g} {parameter.unit} "
+            f"of {crept.name} ({parameter.says}): let the mounts settle, and take the sets anew"
+        )
+        out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, says)))
     worst = max(diagnose.left_out(solution), key=lambda each: each.fall)
     if worst.disagrees:
         explained = worst.fall - 2 * worst.freedom
@@ -86,6 +121,12 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             says = "the sets contradict each other: they are not of one bench, or several of them are bad"
             out.append((explained, CalibrationFinding(True, says)))
     return out
+
+
+def _of_others(solution: Solution) -> list[int]:
+    """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by noise."""
+    ratios = np.array([(np.sqrt(each.variance), each.trust.alike) for each in solution.equations])
+    return [int(k) for k in np.flatnonzero((ratios > _SCATTER * np.median(ratios, axis=0)).all(axis=1))]
 
 
 def _astray(solution: Solution) -> CalibrationFinding:

@@ -227,8 +227,13 @@ _CARRIED = {0: 1, 1: 4, 2: 11, 3: 22}  # Legendre degree -> Noll index
 def profile_legendre() -> Legendre:
     """Depth H(v) of a bowl of unit sag, 0 at the vertex and 1 at the rim, as Legendre series on v in [0, 1]."""
     bowl = FilmLaw(0.0, POISSON_RATIO, 1.0, 1.0).with_sag(1.0)
-    depth = Chebyshev.interpolate(lambda v: bowl.height_mm(np.sqrt(v)), EXCESS_TERMS + 8, domain=[0, 1])
-    return depth.convert(domain=[0, 1], kind=Legendre).truncate(EXCESS_TERMS)
+    return _legendre(bowl, EXCESS_TERMS + 8).truncate(EXCESS_TERMS)
+
+
+def _legendre(bowl: Bowl, degree: int) -> Legendre:
+    """A bowl's depth in mm as a series on v in [0, 1]."""
+    depth = Chebyshev.interpolate(lambda v: bowl.height_mm(np.sqrt(v)), degree, domain=[0, 1])
+    return depth.convert(domain=[0, 1], kind=Legendre)
 
 
 @cache
@@ -249,6 +254,44 @@ def excess() -> FloatArray:
     out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef
     out.setflags(write=False)
     return np.asarray(out)
+
+
+# Round terms beyond the 36 that a calibration does not take from Hencky: Legendre degrees 5 to 7, of unit RMS
+BEYOND = (5, 6, 7)
+
+
+@cache
+def beyond() -> FloatArray:
+    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the 36, each 0 at the vertex."""
+    out = np.zeros((len(BEYOND), EXCESS_TERMS))
+    for row, degree in zip(out, BEYOND, strict=True):
+        power = np.sqrt(2 * degree + 1) * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
+        row[1 : degree + 1] = power[1:]
+    out.setflags(write=False)
+    return out
+
+
+@cache
+def _family() -> tuple[FloatArray, FloatArray]:
+    """Legendre degree 4 (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
+    rows = []
+    for slackness in np.linspace(1e-3, SLACKEST, 240):
+        bowl = Bowl(np.asarray(slackness), np.ones(()), POISSON_RATIO, 1.0)
+        coef = _legendre(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
+        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (4, *BEYOND)])
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:]
+
+
+def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
+    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at this sag.
+
+    At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
+    """
+    own = profile_legendre().coef[[4, *BEYOND]] / np.sqrt(2 * np.array([4, *BEYOND]) + 1) / excess_rms()
+    fourth, others = _family()
+    there = [np.interp(excess_mm * own[0] / sag_mm, fourth, other) for other in others.T]
+    return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
 
 
 @cache

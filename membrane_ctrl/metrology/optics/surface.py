@@ -23,6 +23,7 @@ class Surface:
     coeffs_mm: FloatArray  # (36,): Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0
     hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
     radius_mm: float  # radius of the Zernike disc
+    beyond_mm: tuple[float, ...] = ()  # of `film_law.BEYOND`: a calibration's; a measurement has none
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
@@ -48,7 +49,8 @@ class Surface:
     @cached_property
     def excess(self) -> FloatArray:
         """The excess as a power series in (r / R)^2, in mm."""
-        return self.hencky_mm * film_law.excess()
+        own = self.hencky_mm * film_law.excess()
+        return own + np.array(self.beyond_mm) @ film_law.beyond() if self.beyond_mm else own
 
     @property
     def sag_mm(self) -> float:
