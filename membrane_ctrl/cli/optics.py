@@ -54,8 +54,13 @@ def export_figure(
 
 
 def film(
-    folders: Annotated[list[Path], typer.Argument(metavar="SET...", help="Capture sets at different pressures.")],
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="SET...|RUN...", help="Capture sets at different pressures, or runs."),
+    ],
     geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the sets' own.")] = None,
+    prestrain: Annotated[float, typer.Option(help="RUN: pre-strain of the film, 1e-3 is 0.1 %.")] = 0.0,
+    poisson: Annotated[float, typer.Option(min=0.0, max=0.5, help="RUN: its Poisson ratio.")] = 0.35,
     gauge_offset_pa: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero.")] = 1.0,
     gauge_scale: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of its scale, relative.")] = 1e-3,
     gauge_noise_pa: Annotated[float, typer.Option(min=0.01, help="Noise of a set's mean reading, Pa.")] = 0.3,
@@ -63,7 +68,13 @@ def film(
     pictures: Annotated[bool, typer.Option(help="Draw film.png next to the result.")] = True,
     json: JsonOption = False,
 ) -> int:
-    """Determine the film's pre-strain, Poisson ratio and stiffness from sets at several pressures."""
+    """Determine the film's pre-strain, Poisson ratio and stiffness from sets; from runs, its creep."""
+    from membrane_ctrl.run_files.run_folder import is_run
+
+    if all(is_run(folder) for folder in folders):
+        from membrane_ctrl.review.statistics.film_run import film_run_command
+
+        return film_run_command(folders, prestrain, poisson, out, pictures, json)
     from membrane_ctrl.measure.film import FilmOptions, film_command
     from membrane_ctrl.metrology.film_fit import Gauge
 

@@ -30,7 +30,7 @@ _FREEDOM = np.array([1.0, 1.0, 1.0, 0.1])  # of a misfit: the excess has a tenth
 _DIFFERS = 0.1  # of the misfit that differs between the sets, the part that does not follow the sag
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
 _TIMES_SEEN = np.logspace(0, 2.5, 12)  # sizes of the common misfit: never below that of the terms without a law
-_SIZES_MM = np.logspace(-6, -0.5, 10)  # of the other misfit
+_GROWTHS = np.array([0.5, 1.0, 2.0, 4.0, 8.0])  # powers of the sag with which a misfit grows
 # by which the law's misfit is unlike that of the terms without a law: natural logarithm, of a Cauchy distribution
 _UNLIKE = 1.0
 _SURE = 4.0  # sigmas
@@ -169,7 +169,7 @@ def _fit_round(
     x = np.append([0.0, POISSON, 12.0], np.log(start.load))
     if gauged.any():
         x[2] = float(np.mean(log_q - x[3:][gauged]))
-    target = np.append(data, log_q)
+    target, spread = np.append(data, log_q), _relative_spread(figures)
     for _ in range(_ITERATIONS):
         slopes, rest = _slopes(predict, x), target - predict(x)
         tried = _solved(slopes, rest, noise + seen_mm**2 * sum(misfits), known - x, precision)
@@ -177,7 +177,7 @@ def _fit_round(
         x = x + step
         if np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3])):
             allowed = _averaged(
-                _slopes(predict, x), target - predict(x), noise, misfits, known - x, precision, seen_mm
+                _slopes(predict, x), target - predict(x), noise, misfits, known - x, precision, seen_mm, spread
             )
             x = x + allowed.mean * _inside(x, allowed.mean)
             return x, allowed.covariance[:3, :3], allowed.size_mm
@@ -220,6 +220,11 @@ def _alike(figures: Sequence[FilmFigure]) -> FloatArray:
     return np.stack([np.ones((sags.size, sags.size)), np.outer(off, off) + _DIFFERS**2 * np.eye(sags.size)])
 
 
+def _relative_spread(figures: Sequence[FilmFigure]) -> float:
+    sags = np.array([each.sag_mm for each in figures])
+    return float(np.std(sags) / np.mean(sags))
+
+
 @dataclass(frozen=True)
 class _Solved:
     """A linear model's unknowns."""
@@ -254,17 +259,20 @@ def _averaged(
     known: FloatArray,
     precision: FloatArray,
     seen_mm: float,
+    spread: float,
 ) -> _Solved:
-    """The unknowns averaged over the sizes of both misfits; `seen_mm` is the size of misfits elsewhere."""
+    """The unknowns averaged over both misfits' sizes: `seen_mm` elsewhere; the sags differ by `spread`, relative."""
     found, logs, sizes = [], [], []
     for common in seen_mm * _TIMES_SEEN:
-        for differs in _SIZES_MM:
+        for growth in _GROWTHS:
+            differs = growth * spread * common
             one = _solved(
                 design, residual, noise + common**2 * misfits[0] + differs**2 * misfits[1], known, precision
             )
             found.append(one)
             sizes.append(common**2 + differs**2)
-            logs.append(one.log_evidence - np.log1p((np.log(common / seen_mm) / _UNLIKE) ** 2))
+            unlike = np.log([common / seen_mm, growth]) / _UNLIKE
+            logs.append(one.log_evidence - float(np.sum(np.log1p(unlike**2))))
     weight = np.exp(np.array(logs) - np.max(logs))
     weight /= weight.sum()
     means = np.array([one.mean for one in found])
@@ -293,7 +301,7 @@ def _fit_ring(
     """Waves of the ring, and what they add to the figures' parameters (n, 36)."""
     added = np.zeros((len(figures), TERMS))
     waves = []
-    alike = _alike(figures)
+    alike, relative = _alike(figures), _relative_spread(figures)
     for order in (1, 2, 3):
         causes: list[HarmonicCause] = ["prestrain", "flat", "round"] if order > 1 else ["prestrain", "round"]
         terms = _terms(order)
@@ -305,7 +313,7 @@ def _fit_ring(
             data = np.array([each.parameters_mm[terms[parity]] for each in figures]).ravel()
             noise = _shared(figures, terms[parity]) + 1e-14 * np.eye(data.size)
             spread = np.stack([np.kron(part, np.eye(terms.shape[1])) for part in alike])
-            allowed = _averaged(design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm)
+            allowed = _averaged(design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm, relative)
             found.append(allowed)
             added[:, terms[parity]] = (response @ allowed.mean).reshape(len(figures), -1)
         for k, cause in enumerate(causes):

@@ -67,7 +67,7 @@ class CameraBump:
 
 
 @dataclass(frozen=True)
-class Creep:
+class MountCreep:
     """Camera or screen moved evenly from the first set to the last."""
 
     name: str  # of the parameter that explains most of it alone
@@ -153,7 +153,7 @@ def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
 
 
-def creep(solution: solve.Solution) -> Creep | None:
+def creep(solution: solve.Solution) -> MountCreep | None:
     """Whether camera or screen crept from the first set to the last, and what changed most; None if not sure."""
     count, poses = len(solution.states), tuple(range(len(parameters.POSE)))
     if count < _LEAST_TO_CREEP:
@@ -163,7 +163,7 @@ def creep(solution: solve.Solution) -> Creep | None:
     whole = _moved_by(solution, poses, share, sigmas)[1]
     single = [_moved_by(solution, (k,), share, sigmas[[k]]) for k in poses]
     most = max(poses, key=lambda k: single[k][1])
-    found = Creep(parameters.NAMES[most], single[most][0][0], whole, len(poses))
+    found = MountCreep(parameters.NAMES[most], single[most][0][0], whole, len(poses))
     return found if found.sure else None
 
 

@@ -1,0 +1,101 @@
+"""`film RUN...`: the film's stiffness over the hours of runs, its creep, and tomorrow's drift."""
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.measure.results import write_figure, write_json
+from membrane_ctrl.metrology.film_creep import FilmCreep, fit_creep
+from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.run_files.run import Run, open_run
+
+_LEVEL_S, _DAY_S = 60.0, 86_400.0
+_GAUGE = "mean_gauge_pressure_pa"
+_SURE = 1.96  # sigmas of a 95 % interval
+
+
+def film_run_command(
+    folders: Sequence[Path], prestrain: float, poisson: float, out: Path | None, pictures: bool, as_json: bool
+) -> int:
+    """Read the runs, fit the creep, write `creep.json` and its picture. Raises CommandError."""
+    runs = [open_run(folder) for folder in folders]
+    radius_mm = runs[0].config.optics.mirror.radius_mm
+    time_s, sag_mm, pressure_pa = (np.concatenate(part) for part in zip(*map(_readings, runs), strict=True))
+    law = FilmLaw(prestrain, poisson, 1.0, radius_mm)
+    try:
+        stiffness = pressure_pa / law.pressure_pa(law.with_sag(sag_mm))
+        creep = fit_creep(time_s, np.log(stiffness), _DAY_S)
+    except ValueError as error:
+        raise errors.RejectedError(f"film: {error}") from None
+    # at the same pressure a softer film is deeper, as the law says
+    now = law.with_sag(sag_mm[np.argmax(time_s)])
+    softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under(law.pressure_pa(now))
+    um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)
+    table = _table(runs, stiffness, creep, um_per_log) | {"prestrain": prestrain, "poisson": poisson}
+    folder = (out or runs[-1].folder / "film").resolve()
+    with errors.writing(folder):
+        files.make_folder(folder)
+        write_json(folder / "creep.json", table)
+        if pictures:
+            _draw(folder / "creep.png", (time_s - time_s.min()) / 3600, stiffness / 1e3)
+    print(f"written to {folder}", file=sys.stderr)
+    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
+    return 0
+
+
+def _readings(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """UTC in s, sag in mm and gauge pressure in Pa of the cycles of a run that gave a figure."""
+    shapes, level = run.shapes(), run.level(_LEVEL_S, names=(_GAUGE,))
+    known = np.isfinite(level[_GAUGE])
+    good = np.isfinite(shapes.sag_um) & np.isin(shapes.verdict, ("ok", "degraded"))
+    if not (known.any() and good.any()):
+        raise errors.RejectedError(f"{run.folder}: without figures and a gauge a run says nothing of its film")
+    time_s = np.asarray(shapes.time_s[good], float)
+    middle_s = level["time_s"][known] + _LEVEL_S / 2
+    pressure_pa = np.interp(time_s, middle_s, level[_GAUGE][known])
+    return time_s + run.origin_utc.timestamp(), np.asarray(shapes.sag_um[good], float) / 1e3, pressure_pa
+
+
+def _table(runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_log: float) -> dict[str, Any]:
+    return {
+        "schema": "membrane-creep/1",
+        "runs": [run.name for run in runs],
+        "hours": creep.span_s / 3600,
+        "stiffness_n_per_m": float(np.median(stiffness)),
+        "percent_per_decade": 100 * creep.per_decade,
+        "scatter_percent": 100 * creep.scatter,
+        "tomorrow_um": {"value": creep.drift * um_per_log, "sigma": creep.drift_sigma * abs(um_per_log)},
+        "creeps": creep.sure,
+    }
+
+
+def _lines(table: dict[str, Any]) -> list[str]:
+    drift = table["tomorrow_um"]
+    low, high = (drift["value"] + sign * _SURE * drift["sigma"] for sign in (-1, 1))
+    creeps = f"creep      {table['percent_per_decade']:+.3g} % of E t in a decade of time"
+    return [
+        f"runs       {len(table['runs'])}, over {table['hours']:.1f} h; each reading scatters by "
+        f"{table['scatter_percent']:.2g} %",
+        f"E t        {table['stiffness_n_per_m'] / 1e3:.2f} kN/m, if the pre-strain is "
+        f"{1e6 * table['prestrain']:g} um/m and nu {table['poisson']:g}",
+        creeps if table["creeps"] else "creep      none that these readings show",
+        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} um in 24 h; 95 %: {low:+.3g} to "
+        f"{high:+.3g} um, without the weather",
+    ]
+
+
+def _draw(path: Path, hours: FloatArray, stiffness_kn_per_m: FloatArray) -> None:
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(8, 4), layout="constrained")
+    panel = drawing.subplots()
+    panel.plot(hours, stiffness_kn_per_m, ".", markersize=2)
+    panel.set(title="Stiffness that sag and pressure show", xlabel="hours", ylabel="E t (kN/m)")
+    write_figure(path, drawing)
