@@ -61,9 +61,11 @@ def make(
     sags_mm: tuple[float, ...] = SAGS_MM,
     bow_mm: float = 0.0,
     bumped: dict[int, FloatArray] | None = None,
+    prestrain: float = 0.0,
+    poisson: float = 0.3,
 ) -> Truth:
     """Sets with as few points as that and the information of all pixels; `bumped` are other values for some sets."""
-    film = typical_film(NOMINAL_MM, 500.0, seed)
+    film = typical_film(NOMINAL_MM, 500.0, seed, prestrain, poisson)
     rng = np.random.default_rng(seed)
     sigma_mm = PIXEL_SIGMA_MM * np.sqrt(points / PIXELS)
     sets = []
@@ -86,7 +88,7 @@ def _traced(
     camera = CameraPose(geometry.pinhole_mm, geometry.rotation)
     screen = ScreenPose(geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y, bow_mm / 200.0**2)
     rays = geometry.rays(column, row).T
-    met = trace(camera, rays, film.terms, film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)
+    met = trace(camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)
     inside = (met.x_mm**2 + met.y_mm**2 < 475.0**2) & np.isfinite(met.s_x_mm)
     return np.stack([met.s_x_mm, met.s_y_mm])[:, inside], inside
 

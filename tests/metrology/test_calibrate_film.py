@@ -1,0 +1,97 @@
+"""A calibration that does not trust the film: any film gives the same bench, or is refused by its name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
+
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
+from membrane_ctrl.metrology.calibrate.propagate import advice, propagate
+from membrane_ctrl.metrology.calibrate.residuals import SetPhases
+from membrane_ctrl.metrology.calibrate.rim import Rim
+from membrane_ctrl.metrology.calibrate.separable import FilmModel, Trust, less_trust
+from membrane_ctrl.metrology.calibrate.solve import Solution, solve
+from membrane_ctrl.metrology.calibrate.verdict import after
+from membrane_ctrl.metrology.optics.film_law import FilmLaw, beyond_of, excess_rms
+from membrane_ctrl.metrology.optics.geometry import project
+from membrane_ctrl.sim.film import stretched
+
+SIGMAS = sigmas()
+VALUES = 0.7 * SIGMAS * np.random.default_rng(8).normal(size=len(NAMES))
+
+
+def solved(truth: Truth, film: FilmModel, rim: Rim | None = None) -> Solution:
+    problem = truth.problem(SIGMAS)
+    return solve(replace(problem, references=replace(problem.references, film=film), rim=rim))
+
+
+def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
+    truth = make(VALUES, 4, points=600, prestrain=1e-3, poisson=0.35)
+    (finding,) = after(solved(truth, "hencky"))
+    assert finding.fatal
+    assert finding.says.endswith("use --film free")
+    obeyed = solved(truth, "free")
+    assert after(obeyed) == ()
+    sag_um, figure_um = calibrated_errors_um(obeyed, truth)
+    claim = propagate(obeyed, 2, 475.0)
+    assert abs(sag_um) < 3 * claim.sag_um < 20
+    assert figure_um < 3 * claim.figure_rms_um
+
+
+def test_the_terms_beyond_follow_the_excess_of_any_film_of_the_law() -> None:
+    """Against the twin's films."""
+    for prestrain, poisson in ((0.0, 0.3), (1e-3, 0.36), (2e-4, 0.42)):
+        profile = stretched(37.0 / 500.0, prestrain, poisson)[1]
+        depth = 37.0 * np.polynomial.Polynomial(profile)
+        # Legendre terms of unit RMS over the disc, by quadrature
+        x, weight = np.polynomial.legendre.leggauss(60)
+        terms = [
+            np.sum(weight / 2 * depth((x + 1) / 2) * np.sqrt(2 * k + 1) * np.polynomial.Legendre.basis(k)(x))
+            for k in (4, 5, 6, 7)
+        ]
+        law = FilmLaw(0.0, 0.3, 1.0, 500.0).with_sag(37.0)
+        assert excess_rms() > 0
+        assert law.sag_mm == pytest.approx(37.0)
+        hencky = np.array([2150.47, 206.34, 21.05, 2.24])  # nm at 37 mm
+        excess_mm = terms[0] / (1e-6 * hencky[0]) * 37.0 * excess_rms()
+        expected = np.array(terms[1:]) - terms[0] * hencky[1:] / hencky[0]
+        assert beyond_of(excess_mm, 37.0) == pytest.approx(expected, abs=2e-8), (prestrain, poisson)
+
+
+def test_a_mount_that_creeps_is_named() -> None:
+    moved = {k: VALUES + 0.1 * k * (np.array(NAMES) == "screen_x_mm") for k in range(len(SAGS_MM))}
+    (finding,) = after(solved(make(VALUES, 5, points=600, bumped=moved), "free"))
+    assert finding.fatal
+    assert finding.says.startswith("camera or screen crept from set0 to set4")
+
+
+def test_the_rim_knows_the_size_and_better_measurements_are_advised() -> None:
+    truth = make(VALUES, 6, points=600)
+    theta = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
+    edges = project(bench_at(STATED, VALUES).geometry, np.stack([x, y, truth.film.height_mm(x, y)]))
+    with_rim, without = solved(truth, "free", Rim(edges, 500.0, 0.02)), solved(truth, "free")
+    claims = [propagate(solution, 2, 475.0).sag_um for solution in (with_rim, without)]
+    assert claims[0] < 0.95 * claims[1]
+    assert abs(calibrated_errors_um(with_rim, truth)[0]) < 3 * claims[0]
+    best = advice(without, 2)
+    assert best is not None
+    better = SIGMAS.copy()
+    better[NAMES.index(best.name)] = best.sigma
+    obeyed = solve(truth.problem(better))
+    assert propagate(obeyed, 2, 475.0).sag_um == pytest.approx(best.sag_um, rel=0.05)
+
+
+def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() -> None:
+    rng = np.random.default_rng(1)
+    column, row = rng.uniform(0, 1000, (2, 3000))
+    phases = SetPhases("a", column, row, np.zeros((2, 3000)), np.ones(3000), 0.0)
+    noise = rng.normal(size=(3, 2, 3000))
+    pattern = np.sin(column / 90) * np.cos(row / 70)
+    for shared, least, most in ((0.0, 1.0, 1.2), (0.8, 1.5, 12.0)):
+        left = list(noise + shared * pattern)
+        found = less_trust([phases] * 3, left, [Trust.full(phases)] * 3)
+        assert all(least <= trust.variance <= most for trust in found), shared
