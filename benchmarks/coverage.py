@@ -12,6 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,8 @@ from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
 from membrane_ctrl.metrology.checked import RejectedSetError, check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.full import LASER_NOISE_UM, FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
@@ -41,23 +43,75 @@ from membrane_ctrl.model.shape_estimate import judge
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
+from membrane_ctrl.sim.optics.trace import Trace
 
 FloatArray = NDArray[np.float64]
 
+AIR_PER_MM = 0.93e-9  # bend of a ray per mm and K/m: the air's refractive index falls with temperature
+GLASS_INDEX = 1.52
+STEEL_PER_K = 12e-6
 BENCHES = 60
 ANSWERS = Path("logs/coverage.jsonl")
 SHRINK = 8  # 64 pixels in one: the noise of the pixels counts eight times
 POINTS = 10  # of the map, at random
 TERMS = range(3, 11)  # Noll 4..11
+LIVE_BIN_PX = 2
 CALIBRATED = 0.01  # of the default sigmas
 CAMERA = CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
 
 
+@dataclass
+class BentRays(OpticsRenderer):
+    """The twin's film and screen, seen by rays that the air bends and that end on pixels behind glass.
+
+    Temperature that grows upward bends a ray down: it is a parabola. The screen's plane is the front of the glass.
+    """
+
+    air_k_per_m: float = 0.0
+    glass_mm: float = 0.0
+
+    def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
+        found = super()._trace(directions, displacement_um)
+        start, bend = self._camera_pose.position_mm, np.array([0.0, -AIR_PER_MM * self.air_k_per_m, 0.0])
+        vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
+
+        def height_mm(x: FloatArray, y: FloatArray) -> FloatArray:
+            return self.film.height_mm(x, y, displacement_um)
+
+        seen = np.isfinite(found.s_x_mm) & (found.x_mm**2 + found.y_mm**2 < (1.05 * self.film.radius_mm) ** 2)
+        ray = directions[seen]
+        t = ((found.x_mm[seen] - start[0]) / ray[:, 0])[:, None]
+        for _ in range(6):  # fixed point: the film is flat beside the rays
+            p = start + t * ray + t**2 / 2 * bend
+            t = t + ((vertex_z_mm + height_mm(p[:, 0], p[:, 1]) - p[:, 2]) / ray[:, 2])[:, None]
+        p = start + t * ray + t**2 / 2 * bend
+        x, y, step = p[:, 0], p[:, 1], 0.05
+        slopes = [height_mm(x + dx, y + dy) - height_mm(x - dx, y - dy) for dx, dy in ((step, 0), (0, step))]
+        normal = np.stack([-slopes[0] / (2 * step), -slopes[1] / (2 * step), np.ones_like(x)], axis=1)
+        arriving = ray + t * bend
+        away = arriving - 2 * np.sum(arriving * normal, axis=1, keepdims=True) * normal / np.sum(
+            normal**2, axis=1, keepdims=True
+        )
+        screen = self._screen_pose
+        face = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
+        q, out, down = (p - screen.origin_mm) @ face.T, away @ face.T, face @ bend
+        path = -q[:, 2] / out[:, 2]
+        for _ in range(6):
+            on = q + path[:, None] * out + path[:, None] ** 2 / 2 * down
+            off_mm = screen.bow_per_mm * np.sum(on[:, :2] ** 2, axis=1)
+            path = path + (off_mm - on[:, 2]) / out[:, 2]
+        on = q + path[:, None] * out + path[:, None] ** 2 / 2 * down
+        across = out[:, :2] / np.linalg.norm(out, axis=1, keepdims=True) / GLASS_INDEX  # Snell
+        behind = on[:, :2] + self.glass_mm * across / np.sqrt(1 - np.sum(across**2, axis=1, keepdims=True))
+        for name, value in (("x_mm", x), ("y_mm", y), ("s_x_mm", behind[:, 0]), ("s_y_mm", behind[:, 1])):
+            getattr(found, name)[seen] = value
+        return found
+
+
 def stated_bench(calibrated: bool) -> OpticsConfig:
-    """The bench that the sets state; the twin has no glass and no air."""
+    """The bench that the sets state."""
     share = CALIBRATED if calibrated else 1.0
     sigmas = {name: share * value for name, value in SigmasConfig().model_dump().items()}
-    sigmas |= {"glass_mm": 0.0, "air_k_per_m": 0.0, "temperature_k": 0.0}
     geometry = GeometryConfig(
         a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, a_sigma_mm=2.0 * share, b_sigma_mm=2.0 * share,
         alpha_sigma_deg=0.3 * share, sigmas=SigmasConfig(**sigmas), reference_displacement_um=0.0,
@@ -65,16 +119,22 @@ def stated_bench(calibrated: bool) -> OpticsConfig:
     return OpticsConfig(geometry=geometry, camera=CAMERA)
 
 
+def stated_sigmas(stated: OpticsConfig) -> SigmasConfig:
+    """Of what is not calibrated."""
+    return stated.geometry.sigmas or SigmasConfig()
+
+
 def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> OpticsConfig:
-    """The bench as it really is."""
+    """The bench as it really is, grown since it was measured."""
     spread, _ = spread_of(stated, None)
     off = dict(zip(spread.names, spread.draw(rng), strict=True))
     there = bench_at(Geometry.from_config(stated), np.array([off.get(name, 0.0) for name in NAMES]))
     geometry = there.geometry
+    grown = 1 + STEEL_PER_K * stated_sigmas(stated).temperature_k * rng.standard_normal()
     rows = [tuple(row) for row in geometry.rotation]
-    camera = CameraPoseConfig(position_mm=tuple(geometry.pinhole_mm), rotation=(rows[0], rows[1], rows[2]))
+    camera = CameraPoseConfig(position_mm=tuple(grown * geometry.pinhole_mm), rotation=(rows[0], rows[1], rows[2]))
     screen = ScreenPoseConfig(
-        origin_mm=tuple(geometry.screen_origin_mm),
+        origin_mm=tuple(grown * geometry.screen_origin_mm),
         s_x=tuple(geometry.screen_s_x),
         s_y=tuple(geometry.screen_s_y),
         bow_mm=off["bow_mm"],
@@ -126,7 +186,9 @@ class Room:
         if self.stale:
             late = int(rng.integers(1, 8))
             frames[late] = frames[late - 1]
-        readings = where_um + rng.standard_normal(len(shown)) if self.laser else np.full(len(shown), np.nan)
+        readings = (
+            where_um + LASER_NOISE_UM * rng.standard_normal(len(shown)) if self.laser else np.full(len(shown), np.nan)
+        )
         sinusoids = [k for k, pattern in enumerate(shown) if pattern.role == "sin"]
         self.mean_um = float(where_um[sinusoids].mean())
         return FrameStack(np.stack(frames), tuple(shown), readings, {})
@@ -144,6 +206,18 @@ def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, Exami
     if verdict == "ok" and (checked.flags or examined.doubts):
         verdict = "degraded"
     return full, examined, verdict
+
+
+def live_answer(live: LiveReconstructor, stack: FrameStack, truth: FloatArray) -> FloatArray | None:
+    """Error, own sigma and geometry's sigma (3, 9) of sag and terms in um, as a running hold has them."""
+    found = live.full(list(stack.frames), np.arange(18.0), stack.displacement_um)
+    if found.verdict == "rejected":
+        return None
+    terms = list(TERMS)
+    true_um = 1e3 * np.append(sag_gradient() @ truth, (parameter_to_coeffs() @ truth)[terms])
+    own = np.append(found.sag_sigma_um, np.sqrt(np.diag(found.covariance_um2)[terms]))
+    common = np.append(found.geometry_sag_sigma_um, np.sqrt(np.diag(live.geometry_covariance_um2)[terms]))
+    return np.stack([np.append(found.sag_um, found.coeffs_um[terms]) - true_um, own, common])
 
 
 def quantities(points_mm: FloatArray) -> FloatArray:
@@ -165,8 +239,11 @@ def bench(seed: int) -> dict[str, Any]:
     rng = np.random.default_rng((2026, seed))
     stated = stated_bench(calibrated=bool(seed % 2))
     film = typical_film(37.1, 500.0, seed)
-    renderer, room = OpticsRenderer(true_bench(stated, rng), film, seed=seed), Room(rng)
-    renderer.light = Light(gamma=room.gamma)
+    there, room, sigmas = true_bench(stated, rng), Room(rng), stated_sigmas(stated)
+    air_k_per_m, glass_mm = rng.standard_normal(2) * (sigmas.air_k_per_m, sigmas.glass_mm)
+    renderer = BentRays(
+        there, film, Light(gamma=room.gamma), seed=seed, air_k_per_m=air_k_per_m, glass_mm=abs(glass_mm)
+    )
 
     def render(pattern: Any, displacement_um: float, gain: float) -> FloatArray:
         return renderer.render(pattern, displacement_um, gain=gain).astype(float)
@@ -174,19 +251,31 @@ def bench(seed: int) -> dict[str, Any]:
     radius, angle = 475 * np.sqrt(rng.random(POINTS)), 2 * np.pi * rng.random(POINTS)
     rows = quantities(np.stack([radius * np.cos(angle), radius * np.sin(angle)]))
     found, answer = [], {"seed": seed, "calibrated": bool(seed % 2), "causes": room.causes()}
+    spread, _ = spread_of(stated, None)
+    live, seen_live = LiveReconstructor(stated, LIVE_BIN_PX, laser_noise_um=LASER_NOISE_UM, spread=spread), []
     for _ in range(2):
+        stack = room.stack(render, rng)
+        truth = truth_of(film, room.mean_um)
+        seen_live.append(live_answer(live, stack, truth) if room.laser else None)  # a hold has one
         try:
-            full, examined, verdict = measured(room.stack(render, rng), stated)
+            full, examined, verdict = measured(stack, stated)
         except RejectedSetError as error:
             return answer | {"verdict": "rejected", "reason": str(error)}
         if verdict == "rejected":
             return answer | {"verdict": "rejected", "reason": "quality"}
         # without a laser, which pressure the figure belongs to is unknown: the truth is at the mean
-        off = full.surface.parameters - truth_of(film, room.mean_um)
-        found.append((off, examined.budget, verdict, examined.doubts))
+        found.append((full.surface.parameters - truth, examined.budget, verdict, examined.doubts))
     (first, budget, verdict, doubts), (second, later, _, _) = found
     covariances = budget.covariance(True) + budget.covariance(False), later.change_covariance(budget)
     sigma, change = (np.sqrt(np.einsum("ij,jk,ik->i", rows, c, rows)) for c in covariances)
+    first_live, second_live = seen_live
+    if first_live is not None and second_live is not None:
+        answer |= {
+            "live_error_um": first_live[0].tolist(),
+            "live_sigma_um": np.hypot(first_live[1], first_live[2]).tolist(),
+            "live_change_error_um": (second_live[0] - first_live[0]).tolist(),
+            "live_change_sigma_um": np.hypot(first_live[1], second_live[1]).tolist(),
+        }
     return answer | {
         "verdict": verdict,
         "doubts": list(doubts),
@@ -212,15 +301,16 @@ def answers(count: int) -> list[dict[str, Any]]:
 
 
 def held(given: list[dict[str, Any]], of: str, part: slice = slice(None)) -> tuple[float, float, int]:
-    """Share of 95 % intervals that hold the truth, median sigma over RMS error, and intervals."""
-    pairs = [(one[f"{of}error_um"][part], one[f"{of}sigma_um"][part]) for one in given if "error_um" in one]
+    """Share of 95 % intervals that hold the truth, bar over scatter (1 is sharp), and intervals."""
+    pairs = [(one[f"{of}error_um"][part], one[f"{of}sigma_um"][part]) for one in given if f"{of}error_um" in one]
     if not pairs:
         return math.nan, math.nan, 0
     error, sigma = np.array(pairs).transpose(1, 0, 2)
     ratio = np.abs(error) / sigma
-    return float(np.mean(ratio < 1.96)), float(np.median(sigma) / np.sqrt(np.median(error**2)) * 0.6745), error.size
+    return float(np.mean(ratio < 1.96)), 0.6745 / float(np.median(ratio)), error.size
 
 
+_ANSWERED = {"": "height", "change_": "change", "live_": "live cycle", "live_change_": "live change"}
 _PARTS = {"sag": slice(0, 1), "Z4..Z11": slice(1, 9), "map": slice(9, None)}
 
 
@@ -231,9 +321,11 @@ def run(count: int = BENCHES) -> list[Figure]:
     for state in (False, True):
         some = [one for one in given if one["calibrated"] == state]
         name = "sigmas / 100" if state else "sigmas by hand"
-        for of, what in (("", "height"), ("change_", "change")):
+        for of, what in _ANSWERED.items():
             for quantity, part in _PARTS.items():
                 share, width, size = held(some, of, part)
+                if not size:
+                    continue
                 label = f"{name}, {what}: {quantity} in its 95 % interval ({size})"
                 figures.append(Figure(label, 100 * share, "%", "width over scatter", width, "93 .. 97"))
     sure = [one for one in given if one["verdict"] == "ok"]

@@ -134,6 +134,8 @@ def measure_capture(
     if verdict == "ok":
         verdict, reason = checked.verdict
     timing = {"load": load_s, "phase": middle - begin, "reconstruct": end - middle}
+    none = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)  # what follows needs no frames: they are large
+    checked = replace(checked, stack=replace(checked.stack, frames=none))
     return Measurement(capture.head, verdict, reason, checked.flags, checked, full, mean_um, timing)
 
 

@@ -179,8 +179,8 @@ def _spot(sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray) ->
     aside = np.cross([0.0, 1.0, 0.0], axis)
     aside /= np.linalg.norm(aside)
     across = np.stack([aside, np.cross(axis, aside)])
-    ray = 2 * (axis @ normals) * normals - axis[:, None]
-    rate = across @ ray / (axis @ ray)
+    along = axis @ normals  # a ray is 2 along n - axis
+    rate = (across @ normals) * (2 * along / (2 * along * along - 1))
     start = across @ points_mm - rate * (axis @ points_mm)
     rate -= rate.mean(axis=1, keepdims=True)
     start -= start.mean(axis=1, keepdims=True)

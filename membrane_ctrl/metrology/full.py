@@ -32,7 +32,6 @@ class FullResult:
 
     fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
     index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
-    field: FloatArray  # (6, n): x, y in mm, measured slopes, fitted slopes
     weights: FloatArray  # (n,): weight in the fit
     swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
     # (n,): residual of the frames after the sinusoids: noise, motion, the display's harmonics
@@ -140,23 +139,17 @@ def reconstruct_full(
     rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
     rough = reconstruct.solve(tracer, rough_points, start or reconstruct.parabola(_START_SAG_MM, tracer.radius_mm))
     tracer.intersect(points, rough.surface, newton=2)
-    first = reconstruct.solve(tracer, points, rough.surface, normal=tracer.normal_matrix(points), max_iterations=2)
-    tracer.intersect(points, first.surface)
-    field = tracer.slope_field(points, first.surface)
-    points.weights[:] = tukey(np.hypot(field[2] - field[4], field[3] - field[5]))
-    del field
+    points.weights[:] = tukey(_slopes_left(tracer, points, rough.surface)[1])
     tolerance = _LAST_CHANGE_MM * reconstruct.CONTRACTION
     fit = reconstruct.solve(
-        tracer, points, first.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance
+        tracer, points, rough.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance
     )
     tracer.intersect(points, fit.surface)
-    field = tracer.slope_field(points, fit.surface)
-    seen = np.hypot(field[2] - field[4], field[3] - field[5]) < _NO_SLOPE
-    grid = zonal.residual_grid(field, seen.astype(float), optics.mirror.analysis_radius_mm)
+    field, left = _slopes_left(tracer, points, fit.surface)
+    grid = zonal.residual_grid(field, (left < _NO_SLOPE).astype(float), optics.mirror.analysis_radius_mm)
     return FullResult(
-        fit=replace(fit, changes_mm=(*rough.changes_mm, *first.changes_mm, *fit.changes_mm)),
+        fit=replace(fit, changes_mm=(*rough.changes_mm, *fit.changes_mm)),
         index=pixels.index,
-        field=field,
         weights=points.weights,
         swing_adu=pixels.swing_adu,
         rest_adu=pixels.rest_adu,
@@ -165,6 +158,14 @@ def reconstruct_full(
         quality=_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,
     )
+
+
+def _slopes_left(
+    tracer: reconstruct.Tracer, points: reconstruct.Points, surface: Surface
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes (6, n) of `Tracer.slope_field`, and how far (n,) the measured ones are from the surface's."""
+    field = tracer.slope_field(points, surface)
+    return field, np.hypot(field[2] - field[4], field[3] - field[5])
 
 
 def tukey(residual: FloatArray) -> FloatArray:

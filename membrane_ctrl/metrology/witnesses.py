@@ -1,7 +1,7 @@
 """What a set itself says of its own errors: blur, a film that moved unseen, a rim that is not where it should be."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen th
 _UNSEEN_UM = 1000.0  # of the film's motion without a laser, before the fringes are asked
 _UNKNOWN_UM = 20.0  # of the film's place without a laser: a hold, or a mirror left alone for minutes
 _SIGMAS = 4.0  # of the fringes' answer: the film moved
+# Motion from x to y over its RMS among the steps of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
+_X_TO_Y = 5.0
 _STEP_MM = 0.01
 
 
@@ -50,6 +52,7 @@ class UnseenMotion:
 
     moved_um: float
     sigma_um: float
+    noise_um: float  # the part of `sigma_um` that another set of the bench does not share
 
     @property
     def sure(self) -> bool:
@@ -57,9 +60,9 @@ class UnseenMotion:
         return abs(self.moved_um) > _SIGMAS * self.sigma_um
 
     @property
-    def uncertain_um(self) -> float:
-        """Standard uncertainty of the motion that is left in the figure, since it is not taken out."""
-        return math.hypot(self.moved_um, self.sigma_um)
+    def shared_um(self) -> float:
+        """The part of `sigma_um` that the bench's geometry makes."""
+        return math.sqrt(max(self.sigma_um**2 - self.noise_um**2, 0.0))
 
 
 def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
@@ -81,10 +84,14 @@ def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
     inputs = np.stack([moved.ravel() for moved in explained], axis=1)
     inputs = inputs - fitted @ np.linalg.lstsq(fitted, inputs, rcond=None)[0]
     left = bench.residual_mm.ravel()
-    variance = float(np.mean(left**2))
-    covariance = np.linalg.inv(inputs.T @ inputs / variance + np.eye(inputs.shape[1]))
-    answer = covariance @ (inputs.T @ left) / variance
-    return UnseenMotion(_UNSEEN_UM * float(answer[-1]), _UNSEEN_UM * math.sqrt(covariance[-1, -1]))
+    answer, gram = np.zeros(inputs.shape[1]), inputs.T @ inputs
+    for _ in range(3):  # the scatter is what the inputs do not explain
+        variance = float(np.mean((left - inputs @ answer) ** 2))
+        covariance = np.linalg.inv(gram / variance + np.eye(inputs.shape[1]))
+        answer = covariance @ (inputs.T @ left) / variance
+    noise = covariance @ (gram / variance) @ covariance
+    moved_um, *sigmas = answer[-1], math.sqrt(covariance[-1, -1]), math.sqrt(noise[-1, -1])
+    return UnseenMotion(*(_UNSEEN_UM * float(value) for value in (moved_um, *sigmas)))
 
 
 def _rim_failed(outline: Outline) -> bool:
@@ -156,10 +163,10 @@ def examine(
     sources = [
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *budget.bench_sources(bench, sigmas),
-        film,
+        *film,
         _vertex(bench, sigmas, checked),
         blur,
-        *budget.frame_sources(bench, optics, shifts, _film_um(checked), math.isfinite(checked.stack.mean_reading_um)),
+        *budget.frame_sources(bench, optics, shifts, _film_um(checked)),
         *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),
     ]
     return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
@@ -185,18 +192,33 @@ def _film_um(checked: Checked) -> float:
     return float(np.sqrt(np.mean(np.square(checked.film_um - told_um))))
 
 
-def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[budget.Source, list[str]]:
+def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[list[budget.Source], list[str]]:
     """The film's motion from x to y: by the laser, else by the fringes."""
     readings = checked.stack.readings_um
     if np.isfinite(readings).all():
-        of_axes = np.split(readings, 2)
-        corrected = motion.worth_correcting(readings, LASER_NOISE_UM)
-        left_um = 0.0 if corrected else float(np.mean(of_axes[0]) - np.mean(of_axes[1]))
-        sigma_um = math.hypot(left_um, LASER_NOISE_UM * math.sqrt(4 / readings.size))
-        return budget.film_source(bench, sigma_um, "motion of the film from x to y, by the laser"), []
+        sigma_um = _left_by_laser_um(readings, _film_um(checked))
+        says = "motion of the film from x to y, by the laser"
+        return [budget.film_source(bench, (sigma_um,), says, paired=False)], []
     moved = unseen_motion(bench, spread)
-    source = budget.film_source(bench, moved.uncertain_um, "motion of the film from x to y, without a laser")
+    says = "motion of the film from x to y, without a laser"
+    source = budget.film_source(bench, (moved.moved_um, moved.shared_um), says, paired=True)
+    says = "noise of the fringes that show the film's motion from x to y"
+    noise = replace(budget.film_source(bench, (moved.noise_um,), says, paired=False), name="film_seen_um")
     if not moved.sure:
-        return source, []
+        return [source, noise], []
     says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} um from the x to the y frames"
-    return source, [f"{says}, seen in the fringes: record the laser's readings"]
+    return [source, noise], [f"{says}, seen in the fringes: record the laser's readings"]
+
+
+def _left_by_laser_um(readings_um: FloatArray, within_um: float) -> float:
+    """Motion from x to y that is left in the phases, with `within_um` RMS among the frames of an axis.
+
+    Corrected motion leaves the laser's noise. What is not corrected is at most what the laser saw, and hardly more
+    than a film does that moves so little from frame to frame.
+    """
+    noise_um = LASER_NOISE_UM * math.sqrt(4 / readings_um.size)
+    if motion.worth_correcting(readings_um, LASER_NOISE_UM):
+        return noise_um
+    seen_um = float(np.subtract(*(part.mean() for part in np.split(readings_um, 2))))
+    share = (_X_TO_Y * within_um) ** 2 / ((_X_TO_Y * within_um) ** 2 + noise_um**2)
+    return math.hypot(share * seen_um, math.sqrt(share) * noise_um)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.coverage import BentRays
 from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
@@ -16,6 +18,8 @@ from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
+from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
 from membrane_ctrl.metrology.witnesses import Examined, examine
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
@@ -81,6 +85,11 @@ def measured(optics: OpticsConfig, seed: int = 3, blur_px: float = 0.0, y_moved_
     return Outcome(float(np.sqrt(np.mean(error_um**2))), float(error_um[rim].mean()), examined)
 
 
+@cache
+def set_of_the_stated_bench() -> Outcome:
+    return measured(STATED)
+
+
 @pytest.mark.parametrize(
     ("off", "doubt"),
     [
@@ -103,6 +112,33 @@ def test_optics_that_are_off(off: dict[str, float], doubt: str) -> None:
     # the row of the input that was off has the size of the error that it made
     (row, *_) = [row for row in found.examined.budget.rows() if row["name"] in off]
     assert found.height_um == pytest.approx(row["height_rms_um"], rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["air_k_per_m", "glass_mm", "temperature_k"])
+def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
+    """Rays traced through Snell's glass, along parabolas in warm air, on a grown frame: the row is what they do."""
+    film, times = typical_film(37.1, 500.0, 3), 20.0
+    grown = 1 + times * 2.0 * 12e-6 * (name == "temperature_k")
+    bent = {name: times * {"air_k_per_m": 0.5, "glass_mm": 1.0}[name]} if name != "temperature_k" else {}
+    geometry = STATED.geometry.model_copy(update={"a_mm": 2672.0 * grown, "b_mm": 2871.0 * grown})
+    exact = Tracer(Geometry.from_config(STATED), 500.0)
+    surfaces = []
+    for renderer in (
+        BentRays(STATED, film),
+        BentRays(STATED.model_copy(update={"geometry": geometry}), film, **bent),
+    ):
+        seen = renderer.trace_pixels(0.0)
+        inside = np.flatnonzero(seen.x_mm**2 + seen.y_mm**2 < 475**2)[::7]
+        rows, columns = np.divmod(inside, CAMERA.width_px)
+        points = Points.of(exact.geometry.rays(columns, rows), np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside])
+        surfaces.append(solve(exact, points, parabola(37.0, 500.0)).surface.parameters)
+    budget = set_of_the_stated_bench().examined.budget
+    row = next(source for source in budget.sources if source.name == name)
+    heights = height_matrix(X[INSIDE], Y[INSIDE], 500.0)
+    true_um, said_um = 1e3 * heights @ (surfaces[1] - surfaces[0]) / times, 1e3 * heights @ row.effects_mm[:, 0]
+    assert np.sqrt(np.mean(said_um**2)) > 0.1  # or this test would say nothing
+    said_um *= np.sign(said_um @ true_um)  # which way the input is off, nobody knows
+    np.testing.assert_allclose(said_um, true_um, atol=0.03 * float(np.abs(true_um).max()))
 
 
 def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:

@@ -17,8 +17,8 @@ from membrane_ctrl.metrology.phase import AXES
 # Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 um of motion) differ by up to 0.005 rad of step
 # and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 um of figure.
 STEP_RAD = 0.03
-LEVEL_SHARE = 0.015
-SWING_SHARE = 0.03
+LEVEL_SHARE = 0.05
+SWING_SHARE = 0.05
 _FLICKER = 0.03  # of light is called flicker whatever else is wrong
 # A frame taken 15 um off bends the figure by a few um at most; lasers are commonly off by less.
 MOVED_UM = 15.0

@@ -27,7 +27,8 @@ from membrane_ctrl.model.arrays import FloatArray
 
 _GLASS_INDEX = 1.5
 _STEEL_PER_K = 12e-6
-_AIR_PER_MM = 1e-9  # curvature of a ray across a gradient of 1 K/m
+_AIR_PER_MM = 0.92e-9  # curvature of a ray across a gradient of 1 K/m
+_BEND = np.array([[0.0], [-_AIR_PER_MM], [0.0]])  # per K/m: warm air is thin, and rays bend towards the cold
 LIGHT = 5e-4  # of a frame's level or swing, after the correction or below what it can see
 _PATCHES = 40  # across the mirror: slopes that the fit leaves are independent from one to the next
 
@@ -40,7 +41,8 @@ class Source:
     says: str
     sigma: float  # standard uncertainty of the input; NaN for several at once
     effects_mm: FloatArray  # (36, k): independent changes of the parameters, of 1 sigma each, from this input
-    common: bool = True  # whether all sets of a bench share it: it cancels in a change
+    common: bool = True  # whether all sets of a bench share it
+    paired: bool = True  # whether two sets have the same error in the same column: it cancels in a change
 
     @property
     def covariance_mm2(self) -> FloatArray:
@@ -65,10 +67,16 @@ class Budget:
 
         What both share cancels but for the difference of its effects on the two.
         """
-        own = self.covariance(False) + earlier.covariance(False)
-        before = {source.name: source.effects_mm for source in earlier.sources if source.common}
-        parts = [source.effects_mm - before[source.name] for source in self.sources if source.common]
-        return np.asarray(own + np.sum([part @ part.T for part in parts], axis=0))
+        before = {source.name: source for source in earlier.sources}
+        parts = [np.zeros((PARAMETERS, 1))]
+        for own in self.sources:
+            other = before.pop(own.name, None)
+            if other is not None and own.paired and other.paired:
+                parts.append(own.effects_mm - other.effects_mm)
+            else:
+                parts += [own.effects_mm, *([] if other is None else [other.effects_mm])]
+        effects = np.concatenate([*parts, *(left.effects_mm for left in before.values())], axis=1)
+        return np.asarray(effects @ effects.T)
 
     def rows(self) -> list[dict[str, Any]]:
         """Per input, the largest contribution first: its own uncertainty, 1 sigma of sag, height and figure."""
@@ -115,17 +123,16 @@ def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float =
 def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     """What bends the rays or moves the bench beyond its poses."""
     nominal = bench.geometry()
-    point, onto, leaving = _paths(bench)
+    point = nominal.geometry.pinhole_mm[:, None] + bench.t_mm * nominal.geometry.rays(bench.column_px, bench.row_px)
+    leaving = nominal.geometry.screen_points(bench.screen_mm) - point
+    path_mm = np.linalg.norm(leaving, axis=0)
+    leaving /= path_mm
     # tangents of the ray at the screen: in glass sin / n
     across = nominal.geometry.screen_axes @ leaving
     inside = across[:2] / np.sqrt(_GLASS_INDEX**2 - np.sum(across[:2] ** 2, axis=0))
-    yield _disturbed(bench, "glass_mm", "glass in front of the screen's pixels", sigmas.glass_mm, -inside)
-    camera = nominal.geometry.pinhole_mm[:, None]
-    path_mm = np.linalg.norm(point - camera, axis=0) + np.linalg.norm(onto - point, axis=0)
-    bent = np.array([[0.0], [1.0], [0.0]]) * _AIR_PER_MM * path_mm**2 / 2
-    yield _disturbed(
-        bench, "air_k_per_m", "vertical temperature gradient of the air", sigmas.air_k_per_m, _on_screen(bench, bent)
-    )
+    yield _disturbed(bench, "glass_mm", "glass in front of the screen's pixels", sigmas.glass_mm, inside)
+    air_mm = _bent_to_film_mm(bench) + _onto_screen(nominal.geometry, leaving, _BEND * path_mm**2 / 2)
+    yield _disturbed(bench, "air_k_per_m", "vertical temperature gradient of the air", sigmas.air_k_per_m, air_mm)
     grown, values = _STEEL_PER_K * sigmas.temperature_k, np.zeros(len(parameters.NAMES))
     for name, length in (("a_mm", nominal.geometry.pinhole_mm), ("b_mm", nominal.geometry.screen_origin_mm)):
         values[parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
@@ -134,33 +141,36 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     yield Source("temperature_k", says, sigmas.temperature_k, effect[:, None])
 
 
-def _paths(bench: TrialBench) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points (3, n) on the film and on the screen, and unit vectors from the one to the other."""
-    geometry = bench.geometry().geometry
-    point = geometry.pinhole_mm[:, None] + bench.t_mm * geometry.rays(bench.column_px, bench.row_px)
-    onto = geometry.screen_points(bench.screen_mm)
-    return point, onto, (onto - point) / np.linalg.norm(onto - point, axis=0)
+def _bent_to_film_mm(bench: TrialBench) -> FloatArray:
+    """Change (2, n) of the screen points per K/m when the air bends the rays from the camera to the film.
+
+    They meet the film as straight rays do that come from beside the pinhole.
+    """
+    nominal = bench.geometry().geometry
+    beside = replace(nominal, pinhole_mm=nominal.pinhole_mm - _BEND[:, 0] * float(np.mean(bench.t_mm**2)) / 2)
+    tracer, points = _stand(bench, beside, _BEND * bench.t_mm)
+    tracer.intersect(points, bench.surface, newton=3)
+    return tracer.predict_screen(points, bench.surface) - bench.screen_mm
 
 
-def _on_screen(bench: TrialBench, shift: FloatArray) -> FloatArray:
+def _onto_screen(geometry: Geometry, leaving: FloatArray, shift_mm: FloatArray) -> FloatArray:
     """Change (2, n) of the screen points when the rays arrive shifted by (3, n)."""
-    axes, leaving = bench.geometry().geometry.screen_axes, _paths(bench)[2]
-    return np.asarray(axes[:2] @ (shift - leaving * (axes[2] @ shift) / (axes[2] @ leaving)))
+    axes = geometry.screen_axes
+    return np.asarray(axes[:2] @ (shift_mm - leaving * (axes[2] @ shift_mm) / (axes[2] @ leaving)))
 
 
-def _disturbed(
-    bench: TrialBench, name: str, says: str, sigma: float, per_unit_mm: FloatArray, common: bool = True
-) -> Source:
+def _disturbed(bench: TrialBench, name: str, says: str, sigma: float, per_unit_mm: FloatArray) -> Source:
     """A source that moves the screen points by (2, n) mm per unit of the input."""
     effect = bench.solve(bench.geometry(), sigma * per_unit_mm, linear=True) - bench.surface.parameters
-    return Source(name, says, sigma, effect[:, None], common)
+    return Source(name, says, sigma, effect[:, None])
 
 
-def film_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
-    """The film moved by this much from the x frames to the y frames, unknown to the phases."""
-    return _disturbed(
-        bench, "film_x_to_y_um", says, sigma_um, moves_mm(bench) * np.array([[0.5], [-0.5]]), common=False
-    )
+def film_source(bench: TrialBench, sigmas_um: tuple[float, ...], says: str, paired: bool) -> Source:
+    """The film moved by so much, in independent parts, from the x frames to the y frames, unknown to the phases."""
+    half = moves_mm(bench) * np.array([[0.5], [-0.5]])
+    per_um = bench.solve(bench.geometry(), half, linear=True) - bench.surface.parameters
+    sigma_um = math.hypot(*sigmas_um)
+    return Source("film_x_to_y_um", says, sigma_um, np.outer(per_um, sigmas_um), common=False, paired=paired)
 
 
 def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
@@ -172,7 +182,7 @@ def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
         geometry, pinhole_mm=geometry.pinhole_mm + away, screen_origin_mm=geometry.screen_origin_mm + away
     )
     effect = bench.solve(replace(nominal, geometry=farther), linear=True) - bench.surface.parameters
-    return Source("vertex_um", says, sigma_um, effect[:, None], common=False)
+    return Source("vertex_um", says, sigma_um, effect[:, None], common=False, paired=False)
 
 
 def moves_mm(bench: TrialBench) -> FloatArray:
@@ -188,8 +198,8 @@ def predicted_mm(bench: TrialBench, there: parameters.BenchGeometry, surface: Su
     return tracer.predict_screen(points, surface) / there.pitch
 
 
-def _stand(bench: TrialBench, geometry: Geometry) -> tuple[Tracer, Points]:
-    points = Points.of(geometry.rays(bench.column_px, bench.row_px), bench.screen_mm)
+def _stand(bench: TrialBench, geometry: Geometry, bent: FloatArray | float = 0.0) -> tuple[Tracer, Points]:
+    points = Points.of(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
     points.t_mm[:] = bench.t_mm
     return Tracer(geometry, bench.surface.radius_mm, bench.vertex_z_mm), points
 
@@ -209,11 +219,11 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
 
 
 def frame_sources(
-    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float, mean_known: bool
+    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float
 ) -> Iterator[Source]:
     """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`.
 
-    `mean_known`: a laser tells the film's mean, to which the figure then refers.
+    The figure is that of the film's mean position.
     """
     scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
     light: list[FloatArray] = []
@@ -229,10 +239,10 @@ def frame_sources(
                 off = np.zeros_like(bench.screen_mm)
                 off[axis] = turned * error
                 effects.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
-    yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), common=False)
+    yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), False, False)
     says = "motion of the film from frame to frame that no laser has told"
-    mean = np.mean(film, axis=0) if mean_known else np.zeros(PARAMETERS)
-    yield Source("film_um", says, film_um, np.stack(film, axis=1) - mean[:, None], common=False)
+    effects = np.stack(film, axis=1)
+    yield Source("film_um", says, film_um, effects - effects.mean(axis=1, keepdims=True), False, False)
 
 
 def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:
@@ -240,7 +250,7 @@ def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float
     inverse = full.fit.normal.inverse
     middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
     noise = inverse @ np.linalg.cholesky(middle)
-    yield Source("noise_adu", "noise of the pixels", noise_adu, noise, common=False)
+    yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
     left = _left_effects(full, inverse)
     share = max(0.0, 1 - float(np.sum(noise**2)) / max(float(np.sum(left**2)), 1e-300))
     left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
@@ -249,21 +259,22 @@ def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float
 
 
 def _left_effects(full: FullResult, inverse: FloatArray) -> FloatArray:
-    """Effects (36, patches) on the parameters if the residual slopes are independent from patch to patch only."""
-    grid, side = full.grid, -(-full.grid.axis_mm.size // _PATCHES)
-    edges = np.arange(0, grid.axis_mm.size, side)
+    """Effects (36, patches) on the parameters if the residual slopes are independent from patch to patch only.
+
+    The patches are those of the mirror, whatever was seen: two sets of a bench have the same ones.
+    """
+    grid, reach_mm = full.grid, float(full.grid.axis_mm[-1])
+    edges = np.searchsorted(grid.axis_mm, np.linspace(-reach_mm, reach_mm, _PATCHES, endpoint=False))
 
     def summed(cells: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(np.add.reduceat(cells, edges, axis=0), edges, axis=1))
+        return np.asarray(np.add.reduceat(np.add.reduceat(cells, edges, axis=0), edges, axis=1)).ravel()
 
     count = summed(grid.count)
-    seen = count > 0
     x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
     radius_mm = full.surface.radius_mm
-    at = [summed(grid.count * place)[seen] / count[seen] / radius_mm for place in (x, y)]
+    at = [summed(grid.count * place) / np.maximum(count, 1.0) / radius_mm for place in (x, y)]
     _, of_x, of_y = residuals.basis(at[0], at[1])
-    slope_x, slope_y = summed(grid.count * grid.slope_x)[seen], summed(grid.count * grid.slope_y)[seen]
-    pulls = (of_x * slope_x + of_y * slope_y) / radius_mm
+    pulls = (of_x * summed(grid.count * grid.slope_x) + of_y * summed(grid.count * grid.slope_y)) / radius_mm
     return np.asarray(inverse @ pulls)
 
 
