@@ -230,17 +230,22 @@ READS = {
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black"."""
+    """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black".
+
+    `period_mm` is that of further sinusoids, which are coarser than the pattern's own (0).
+    """
 
     role: str
     axis: str = ""
     index: int = 0
     shift_rad: float = 0.0
+    period_mm: float = 0.0
 
     @property
     def name(self) -> str:
-        """The name used for files and Rerun paths: `x_sin_0`, `y_gray_1`, `white`."""
-        return f"{self.axis}_{self.role}_{self.index}" if self.axis else self.role
+        """The name used for files and Rerun paths: `x_sin_0`, `y_gray_1`, `white`, `x_sin_0_of_61.7mm`."""
+        coarser = f"_of_{self.period_mm:g}mm" if self.period_mm else ""
+        return f"{self.axis}_{self.role}_{self.index}{coarser}" if self.axis else self.role
 
 
 Levels = NDArray[np.uint8]  # of a display, or an 8-bit camera

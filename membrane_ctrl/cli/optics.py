@@ -167,6 +167,10 @@ def simulate(
         int, typer.Option(min=1, help="Number of sets; several make a run: 0000 full, the others fringes.")
     ] = 1,
     interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
+    coarser_mm: Annotated[
+        list[float] | None,
+        typer.Option(help="Also fringes of this period, longer than the pattern's, instead of Gray codes; repeatable."),
+    ] = None,
 ) -> int:
     """Simulate a capture set, or a run of sets, with known truth."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command
@@ -190,5 +194,6 @@ def simulate(
         faults=tuple(fault or ()),
         sets=sets,
         interval_s=interval_s,
+        coarser_mm=tuple(coarser_mm or ()),
     )
     return simulate_command(options)

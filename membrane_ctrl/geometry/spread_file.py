@@ -32,6 +32,9 @@ from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
 
 
+_NAMED = 6  # inputs without a stated sigma; the others are counted
+
+
 class CovarianceTable(Section):
     """The `[covariance]` table."""
 
@@ -71,10 +74,18 @@ def spread_of(optics: schema.OpticsConfig, file: Path | None) -> tuple[GeometryS
         optional = {name: sigma for name, sigma in others.items() if name in OPTIONAL_NAMES}
         return given.with_others(optional), f"covariance in {file}"
     stated = stated_spread(geometry)
-    if stated is not None:
-        return stated.with_others(others), "a_sigma_mm, b_sigma_mm, alpha_sigma_deg and sigmas of the geometry"
-    says = "not stated: the paper's 2 mm, 2 mm and 0.3 degrees assumed, data sheets for the rest"
-    return PAPER_SPREAD.with_others(others), says
+    return (PAPER_SPREAD if stated is None else stated).with_others(others), _stated(geometry, stated is not None)
+
+
+def _stated(geometry: schema.GeometryConfig, poses: bool) -> str:
+    """Where the sigmas are from: what the geometry does not state has the defaults of `SigmasConfig`."""
+    given = geometry.sigmas.model_fields_set if geometry.sigmas else set()
+    missing = [] if poses else ["a", "b", "alpha"]
+    missing += [name for name in SigmasConfig.model_fields if name not in given]
+    if not missing:
+        return "sigmas stated with the geometry"
+    named = ", ".join(missing[:_NAMED]) + (f" and {len(missing) - _NAMED} others" if len(missing) > _NAMED else "")
+    return f"no sigma is stated for {named if given or poses else 'any input'}; data-sheet defaults apply"
 
 
 def sigmas_of(optics: schema.OpticsConfig) -> dict[str, float]:

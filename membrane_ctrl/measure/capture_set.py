@@ -40,6 +40,7 @@ class FrameRow(Section):
     axis: Literal["x", "y"] | None = None
     index: Annotated[int, Field(ge=0, le=1023)] = 0
     shift_rad: float | None = None
+    period_mm: Annotated[float, Field(gt=0, le=1e4)] | None = None
     time_s: float | None = None
     displacement_um: float | None = None
 
@@ -48,7 +49,7 @@ class CaptureFile(Section):
     """The content of `capture.toml`."""
 
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
-    kind: Literal["full", "fringes"]
+    kind: Literal["full", "fringes", "frequencies"]
     reference: str | None = None
     pressure_pa: Annotated[float, Field(gt=0, le=1e5)] | None = None
     pattern: schema.PatternConfig
@@ -63,7 +64,7 @@ class CaptureHead:
     """Content of `capture.toml`, checked and in order."""
 
     folder: Path  # of the set
-    kind: Literal["full", "fringes"]
+    kind: Literal["full", "fringes", "frequencies"]
     reference: Path | None  # of a fringes set: the full set that anchors it
     optics: schema.OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`
     bits_stated: bool  # whether the set states its bit depth
@@ -74,6 +75,16 @@ class CaptureHead:
     pressure_pa: float  # gauge pressure during the set; NaN where not stated
     ignored: tuple[str, ...]  # unknown keys of the file
     geometry: GeometryOrigin  # origin of the geometry in `optics`
+
+    @property
+    def fringes(self) -> list[int]:
+        """Frames of the finest sinusoids, which are measured."""
+        return [k for k, p in enumerate(self.patterns) if p.role == "sin" and not p.period_mm]
+
+    @property
+    def mean_reading_um(self) -> float:
+        """Mean laser reading during them, to which the figure belongs; NaN unless all have one."""
+        return float(np.mean(self.displacement_um[self.fringes]))
 
 
 @dataclass(frozen=True)
@@ -197,8 +208,8 @@ def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
     """
     ours, theirs = head.optics, reference.optics
     where = head.folder / "capture.toml"
-    if reference.kind != "full":
-        raise InputError(f"{where}: reference: {reference.folder} is not a full set")
+    if reference.kind == "fringes":
+        raise InputError(f"{where}: reference: {reference.folder} is a set of fringes alone")
     for section in ("camera", "pattern"):
         a, b = getattr(ours, section), getattr(theirs, section)
         for key in ("width_px", "height_px", "periods", "period_mm"):
@@ -262,13 +273,19 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
         pattern = Pattern(row.role, row.axis or "", row.index if row.axis else 0)
         if row.role == "sin":
             shift = 2 * math.pi * row.index / content.pattern.steps if row.shift_rad is None else row.shift_rad
-            pattern = Pattern(row.role, row.axis or "", row.index, shift)
+            pattern = Pattern(row.role, row.axis or "", row.index, shift, _coarser_mm(row, content, path))
         if pattern.name in found:
             raise InputError(
                 f"{path}: frames: {pattern.name} appears twice ({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
     names = [p.name for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)]
+    if content.kind == "frequencies":
+        coarser = sorted({pattern.period_mm for _, pattern in found.values()} - {0.0})
+        if not coarser:
+            raise InputError(f"{path}: frames: a set of kind frequencies needs frames of another period_mm")
+        fringes = fringe_sequence(content.pattern)
+        names += [replace(p, period_mm=period).name for period in coarser for p in fringes]
     if missing := [name for name in names if name not in found]:
         raise InputError(f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs {missing[0]}")
     if extra := [name for name in found if name not in names]:
@@ -277,6 +294,17 @@ def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]
         if times > 1:
             raise InputError(f"{path}: frames: {name} is given for {times} frames")
     return [found[name] for name in names]
+
+
+def _coarser_mm(row: FrameRow, content: CaptureFile, path: Path) -> float:
+    """Period of a frame of coarser fringes; 0 for the pattern's own. Raises InputError."""
+    if row.period_mm is None or row.period_mm == content.pattern.period_mm:
+        return 0.0
+    if content.kind != "frequencies":
+        raise InputError(f"{path}: frames: {row.file} has its own period_mm: the kind of such a set is frequencies")
+    if row.period_mm < content.pattern.period_mm:
+        raise InputError(f"{path}: frames: {row.file}: period_mm = {row.period_mm:g}: pattern.period_mm is the finest")
+    return row.period_mm
 
 
 def _column(values: list[float | None]) -> FloatArray:

@@ -43,7 +43,7 @@ def measure_command(options: MeasureOptions) -> int:
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: unknown key, ignored", file=sys.stderr)
     target = options.out.resolve() if options.out else folder / "result"  # follow a link that the user names
-    light, outline = _outline(measurement)
+    light, outline = light_and_rim(measurement)
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry, outline)
     measurement = results.with_doubts(measurement, bars)
@@ -75,7 +75,7 @@ def measure_command(options: MeasureOptions) -> int:
     return int(errors.Exit.REJECTED if measurement.verdict == "rejected" else errors.Exit.DONE)
 
 
-def _outline(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
+def light_and_rim(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
     """Light of the picture in bins, and the rim found in it."""
     checked, optics = measurement.checked, measurement.head.optics
     if checked is None or measurement.full is None:
@@ -111,7 +111,7 @@ def _lines(
     lines += [
         f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um from noise and the film, "
         f"{of_geometry:.3g} um from the geometry",
-        f"geometry  uncertainty from {bars.source}",
+        f"geometry  {bars.source}",
         f"budget    1 sigma of height {total['height_rms_um']:.3g} um RMS, without its plane "
         f"{total['figure_rms_um']:.3g} um; largest: {largest}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",

@@ -11,6 +11,7 @@ from membrane_ctrl.geometry.file import GeometryFile, require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frames import frame_stack, integrity
+from membrane_ctrl.metrology.frequencies import check_frequencies
 from membrane_ctrl.metrology.full import BinFigure, FullResult, bin_figure, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.reconstruct import HeightFunction
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
@@ -89,10 +90,11 @@ def measure_set(
 def read_anchor(folder: str | Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
     """Read the reference of fringes sets. Raises InputError if it gives no figure."""
     capture = read_set(folder, geometry)
-    if capture.head.kind != "full":
-        raise errors.InputError(f"{capture.head.folder / 'capture.toml'}: kind: a reference must be a full set")
+    if capture.head.kind == "fringes":
+        where = capture.head.folder / "capture.toml"
+        raise errors.InputError(f"{where}: kind: a reference must be a full set or one of several frequencies")
     try:
-        return capture.head, check(stack_of(capture), capture.head.optics).anchor()
+        return capture.head, checked_set(capture, None).anchor()
     except RejectedSetError as error:
         raise errors.InputError(f"{folder}: cannot be a reference: {error}") from None
 
@@ -112,19 +114,23 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     )
 
 
+def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
+    """Check the frames and fit the bins. Raises RejectedSetError if they give no figure."""
+    stack, optics = stack_of(capture), capture.head.optics
+    return check_frequencies(stack, optics) if capture.head.kind == "frequencies" else check(stack, optics, anchor)
+
+
 def measure_capture(
     capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
 ) -> Measurement:
     """Measure frames in memory; never raises, whatever they show."""
     optics = capture.head.optics
-    mean_um = float("nan")
     begin = time.perf_counter()
     try:
-        stack = stack_of(capture)
-        mean_um = stack.mean_reading_um
-        checked = check(stack, optics, anchor)
+        checked = checked_set(capture, anchor)
     except RejectedSetError as error:
         timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}
+        mean_um = capture.head.mean_reading_um
         return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
     pixels = measure_pixels(optics, checked)
     middle = time.perf_counter()
@@ -134,9 +140,10 @@ def measure_capture(
     if verdict == "ok":
         verdict, reason = checked.verdict
     timing = {"load": load_s, "phase": middle - begin, "reconstruct": end - middle}
+    stack = checked.stack
     none = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)  # what follows needs no frames: they are large
-    checked = replace(checked, stack=replace(checked.stack, frames=none))
-    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, mean_um, timing)
+    checked = replace(checked, stack=replace(stack, frames=none))
+    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing)
 
 
 def noise_seen_adu(measurement: Measurement) -> float:
@@ -199,8 +206,7 @@ class Figures:
             capture = replace(capture, head=anchored(capture.head, reference))
         optics = capture.head.optics
         try:
-            stack = stack_of(capture)
-            checked = check(stack, optics, anchor)
+            checked = checked_set(capture, anchor)
         except RejectedSetError as error:
             raise errors.RejectedError(f"{folder}: rejected: {error}") from None
         figure = bin_figure(optics, checked)
@@ -210,9 +216,8 @@ class Figures:
         if verdict == "ok":
             verdict, reason = checked.verdict
         head = capture.head
-        sinusoids = [pattern.role == "sin" for pattern in head.patterns]
-        middle_s = float(head.time_s[sinusoids].mean())
-        return SetFigure(head, checked, figure, verdict, reason, middle_s, stack.mean_reading_um)
+        middle_s = float(head.time_s[head.fringes].mean())
+        return SetFigure(head, checked, figure, verdict, reason, middle_s, head.mean_reading_um)
 
     def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:
         if reference != self._reference:

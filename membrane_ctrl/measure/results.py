@@ -42,6 +42,7 @@ class ErrorBars:
     doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
     grid: monte_carlo.HeightMap  # grid of `maps_um`
     cell_slope: float = 0.0  # 1 sigma of the mean slope of a cell of the height map, from pixel noise
+    zonal_um: float = 0.0  # and of the map's height over the fit
 
     @property
     def noise(self) -> FloatArray:
@@ -63,7 +64,7 @@ class ErrorBars:
     def maps_um(self) -> tuple[FloatArray, FloatArray]:
         """1 sigma (n, n) of the height on `grid.axis_mm`: noise, geometry; NaN outside the analysis radius."""
         of_noise, of_geometry = (self.grid.picture(1e3 * self.grid.sigma(c)) for c in (self.noise, self.geometry))
-        return of_noise, of_geometry
+        return np.hypot(of_noise, self.zonal_um), of_geometry
 
 
 def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline | None = None) -> ErrorBars | None:
@@ -84,7 +85,8 @@ def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
     variance = slope_variance(optics, full, [checked.stack.shifts_rad(used) for used in checked.view.used], noise_adu)
     cell_slope = math.sqrt(float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0])))
-    return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope)
+    zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
+    return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope, zonal_um)
 
 
 def with_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:

@@ -32,6 +32,7 @@ class SimulateOptions:
     faults: tuple[str, ...]
     sets: int
     interval_s: float
+    coarser_mm: tuple[float, ...] = ()
 
 
 def simulate_command(options: SimulateOptions) -> int:
@@ -60,6 +61,8 @@ def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     return simulation_spec.SimulationSpec(
         optics,
         mounted if options.figure else replace(mounted, zernike_um=()),
+        kind="frequencies" if options.coarser_mm else "full",
+        coarser_mm=options.coarser_mm,
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
         motion=options.motion,
         laser_noise_um=options.laser_noise_um,

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.geometry import file, spread_file
-from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.measure.results import write_arrays, write_json
+from membrane_ctrl.measure.measure import light_and_rim
+from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
+from membrane_ctrl.measure.results import error_bars, write_arrays, write_json
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files, terminal
@@ -108,14 +109,16 @@ class Spread:
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray
+    budget: FloatArray  # of the budgets of `measure`: with film, light, blur and the slopes left of each set
 
 
 def uncertainty_command(options: UncertaintyOptions) -> int:
     """Run the trials, write map, table and picture, and report. Raises CommandError."""
-    figures = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
-    sets = [figures.of(folder) for folder in (options.folder, options.against) if folder is not None]
+    given = None if options.geometry is None else file.read_geometry(options.geometry)
+    figures, folders = Figures(given), [folder for folder in (options.folder, options.against) if folder is not None]
+    sets = [figures.of(folder) for folder in folders]
     spread, source = spread_file.spread_of(sets[0].head.optics, options.geometry)
-    print(f"geometry uncertainty: {source}", file=sys.stderr)
+    print(f"geometry: {source}", file=sys.stderr)
     benches = [one.bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:
         raise errors.InputError(f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench")
@@ -124,7 +127,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         benches, spread, options.seed, options.trials, workers=options.workers, scheduler=options.scheduler
     )
     seconds = time.perf_counter() - begin
-    result = _spread(benches, spread, parameters)
+    result = _spread(benches, spread, parameters, _budget(folders, given, options.geometry))
     mirror = sets[0].head.optics.mirror
     grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
@@ -135,13 +138,29 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     return 0
 
 
+def _budget(folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None) -> FloatArray:
+    """Covariance (36, 36) in mm^2 of the only set by its budget, or of the change since the second."""
+    budgets = []
+    for folder in folders:
+        measured = measure_set(folder, given)
+        bars = error_bars(measured, geometry, light_and_rim(measured)[1])
+        if bars is None:
+            raise errors.RejectedError(f"{folder}: rejected: {measured.reason}")
+        budgets.append(bars.budget)
+    own, *earlier = budgets
+    return own.change_covariance(earlier[0]) if earlier else own.covariance(True) + own.covariance(False)
+
+
 def _spread(
-    benches: list[monte_carlo.TrialBench], spread: geometry_spread.GeometrySpread, parameters: FloatArray
+    benches: list[monte_carlo.TrialBench],
+    spread: geometry_spread.GeometrySpread,
+    parameters: FloatArray,
+    budget: FloatArray,
 ) -> Spread:
     """Spread of the only set, or of the first minus the second, trial by trial."""
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
     noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
-    return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise)
+    return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise, budget)
 
 
 def _table(
@@ -152,7 +171,8 @@ def _table(
     result: Spread,
     grid: monte_carlo.HeightMap,
 ) -> dict[str, Any]:
-    rmse, linear, noise = (1e3 * grid.sigma(c) for c in (result.covariance, result.linear, result.noise))
+    spreads = result.covariance, result.linear, result.noise, result.budget
+    rmse, linear, noise, budget = (1e3 * grid.sigma(c) for c in spreads)
     coeffs = np.sqrt(np.diag(parameter_to_coeffs() @ result.covariance @ parameter_to_coeffs().T))
     sag = sag_gradient()
     return {
@@ -167,6 +187,7 @@ def _table(
         "rmse_um": {"mean": float(rmse.mean()), "max": float(rmse.max())},
         "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},
         "noise_um": {"mean": float(noise.mean()), "max": float(noise.max())},
+        "budget_um": {"mean": float(budget.mean()), "max": float(budget.max())},
         "sag_sigma_um": 1e3 * float(np.sqrt(sag @ result.covariance @ sag)),
         "coeffs_sigma_um": (1e3 * coeffs).tolist(),
     }
@@ -177,11 +198,11 @@ def _write(
 ) -> None:
     from membrane_ctrl.measure.stability_results import draw_uncertainty  # matplotlib takes a second to load
 
-    rmse = grid.picture(1e3 * grid.sigma(result.covariance))
+    rmse, whole = (grid.picture(1e3 * grid.sigma(c)) for c in (result.covariance, result.budget))
     with errors.writing(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
-        write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse)
+        write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse, budget_um=whole)
         height = grid.picture(height_um)
         draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
     print(f"written to {out}", file=sys.stderr)
@@ -195,4 +216,6 @@ def _lines(table: dict[str, Any]) -> list[str]:
         f"linear      mean {table['linear_um']['mean']:.4g} um, largest {table['linear_um']['max']:.4g} um",
         f"noise alone mean {table['noise_um']['mean']:.4g} um, largest {table['noise_um']['max']:.4g} um",
         f"sag         1 sigma {table['sag_sigma_um']:.4g} um",
+        f"budget      mean {table['budget_um']['mean']:.4g} um, largest {table['budget_um']['max']:.4g} um: "
+        "also film, light, blur and slopes left of each set",
     ]

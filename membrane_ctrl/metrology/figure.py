@@ -11,6 +11,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
+from membrane_ctrl.metrology import zonal
 from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -197,7 +198,6 @@ _TRIAL_CELLS = 96  # a side, at least
 _WHITE_TRIALS = 4  # on every cell: a mean over thinned cells would be too noisy; to 35 %
 _TILE = 256  # cells
 _EDGE = 0.03  # of the rays, on either side
-_FIT_CYCLES = 4.0  # over the aperture: slower waves belong to the fit
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ def _white(
     square = k_x**2 + k_y**2
     slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
     spectrum = np.fft.fft2(slopes)
-    fast = square > (np.pi * _FIT_CYCLES / aperture_mm) ** 2
+    fast = square > (np.pi * zonal.FIT_CYCLES / aperture_mm) ** 2
     height = np.where(fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0)
     tiles = np.stack([np.fft.ifft2(height).real, *slopes])
     for _ in range(_WHITE_TRIALS):

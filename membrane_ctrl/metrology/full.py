@@ -137,10 +137,11 @@ def reconstruct_full(
     tracer, points = checked.tracer, pixels.points
     # the bins solve from the start; the pixels continue where that has nearly converged
     rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
-    rough = reconstruct.solve(tracer, rough_points, start or reconstruct.parabola(_START_SAG_MM, tracer.radius_mm))
+    tolerance = _LAST_CHANGE_MM * reconstruct.CONTRACTION
+    begin = start or reconstruct.parabola(_START_SAG_MM, tracer.radius_mm)
+    rough = reconstruct.solve(tracer, rough_points, begin, tolerance_mm=tolerance)
     tracer.intersect(points, rough.surface, newton=2)
     points.weights[:] = tukey(_slopes_left(tracer, points, rough.surface)[1])
-    tolerance = _LAST_CHANGE_MM * reconstruct.CONTRACTION
     fit = reconstruct.solve(
         tracer, points, rough.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance
     )

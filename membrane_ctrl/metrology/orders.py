@@ -105,20 +105,25 @@ def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
     mask : (H, W) bool array
         Pixels that see the pattern.
     """
-    coded = absolute_phase(wrapped_rad, *code_orders(bits))
+    return by_votes(wrapped_rad, absolute_phase(wrapped_rad, *code_orders(bits)), mask)
+
+
+def by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Orders:
+    """As `orders`, from absolute phases (H, W) that each pixel has by itself; NaN where it has none."""
     smooth, region = unwrap_regions(wrapped_rad, mask)
     if tear_share(smooth) > _TORN_SHARE:
         return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
     offset = np.round((coded - smooth) / (2 * math.pi))
     votes = np.zeros((region.max() + 1 if mask.any() else 0, 65), np.int64)  # orders differ by 32 at most
-    place = np.clip(offset[mask], -32, 32).astype(np.int64) + 32
-    np.add.at(votes, (region[mask], place), 1)
+    voting = mask & np.isfinite(coded)
+    place = np.clip(offset[voting], -32, 32).astype(np.int64) + 32
+    np.add.at(votes, (region[voting], place), 1)
     winner = np.argmax(votes, axis=1) - 32.0 if len(votes) else np.zeros(0)
     small = votes.sum(axis=1) < _LEAST_VOTES
     winner[small] = np.nan
     shift = np.full(mask.shape, np.nan)
     shift[mask] = winner[region[mask]]
-    known = np.isfinite(shift)
+    known = np.isfinite(shift) & voting
     agreement = float(np.mean(offset[known] == shift[known])) if known.any() else 0.0
     if agreement < _LEAST_AGREEMENT:
         return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)

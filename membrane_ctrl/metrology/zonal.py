@@ -163,6 +163,7 @@ class MaskedLaplacian:
 
 
 _CELLS_A_SIDE = 951  # over the analysis' diameter: 1 mm cells on a 1 m mirror, near two pixels each
+FIT_CYCLES = 4.0  # over the aperture: slower waves belong to the fit
 _PIXELS_A_CELL = 1.5  # with fewer, cells would be empty between pixels
 
 
@@ -179,6 +180,15 @@ class ResidualGrid:
     def step_mm(self) -> float:
         """Side of a cell."""
         return float(self.axis_mm[1] - self.axis_mm[0])
+
+    def noise_mm(self, cell_slope: float) -> float:
+        """1 sigma of the integrated height when the cells' slopes have this white noise.
+
+        The height's density over the plane of waves k is (slope step / k)^2, from the fastest that the grid holds to
+        the slowest that the fit of 36 terms leaves.
+        """
+        fastest, slowest = 2 * math.sqrt(math.pi) / self.step_mm, math.pi * FIT_CYCLES / float(self.axis_mm[-1])
+        return cell_slope * self.step_mm * math.sqrt(max(math.log(fastest / slowest), 0.0) / (2 * math.pi))
 
 
 @kernel

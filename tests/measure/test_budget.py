@@ -114,7 +114,9 @@ def test_optics_that_are_off(off: dict[str, float], doubt: str) -> None:
     assert found.height_um == pytest.approx(row["height_rms_um"], rel=0.15)
 
 
-@pytest.mark.parametrize("name", ["air_k_per_m", "glass_mm", "temperature_k"])
+@pytest.mark.parametrize(
+    "name", ["air_k_per_m", "glass_mm", pytest.param("temperature_k", marks=pytest.mark.campaign)]
+)
 def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
     """Rays traced through Snell's glass, along parabolas in warm air, on a grown frame: the row is what they do."""
     film, times = typical_film(37.1, 500.0, 3), 20.0

@@ -352,7 +352,7 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     said = capsys.readouterr().out
     assert "from noise" in said
     assert "largest: principal_x_px" in said
-    assert "the paper's 2 mm, 2 mm and 0.3 degrees assumed" in said
+    assert "geometry  no sigma is stated for any input; data-sheet defaults apply" in said
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")
     assert (

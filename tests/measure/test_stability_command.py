@@ -150,7 +150,7 @@ def test_runs_repeat_and_do_not_take_their_results_for_sets(
     said = capsys.readouterr()
     assert "4 of 4 used" in said.out
     assert "no pairs" in said.out  # of ten minutes
-    assert "not stated" in said.out  # where the geometry's sigmas come from
+    assert "no sigma is stated for any input" in said.out  # where the geometry's sigmas come from
     code, second = analysed(spoiled, tmp_path / "again", "--json")
     assert code == 0
     assert json.loads(capsys.readouterr().out) == second

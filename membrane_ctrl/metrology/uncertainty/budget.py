@@ -241,8 +241,8 @@ def frame_sources(
                 effects.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
     yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), False, False)
     says = "motion of the film from frame to frame that no laser has told"
-    effects = np.stack(film, axis=1)
-    yield Source("film_um", says, film_um, effects - effects.mean(axis=1, keepdims=True), False, False)
+    of_film = np.stack(film, axis=1)
+    yield Source("film_um", says, film_um, of_film - of_film.mean(axis=1, keepdims=True), False, False)
 
 
 def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:

@@ -4,7 +4,7 @@ Nodes are `step` pixels apart, one before the first pixel and two after the last
 nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing is interpolated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
 
@@ -197,7 +197,7 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     if pattern.role == "sin":
         phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
-        return LevelTable(_lit(levels, light), config.period_mm / _SINE_CELLS, smooth=True)
+        return LevelTable(_lit(levels, light), (pattern.period_mm or config.period_mm) / _SINE_CELLS, smooth=True)
     half_periods = np.arange(2 * config.periods)
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
         codes = half_periods ^ (half_periods >> 1)
@@ -209,19 +209,23 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     return LevelTable(_lit(levels, light), config.period_mm / 2.0, smooth=False)
 
 
-def pattern_sequence(kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = ()) -> list[Pattern]:
+def pattern_sequence(
+    kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = (), coarser_mm: tuple[float, ...] = ()
+) -> list[Pattern]:
     """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
 
-    The kind is "full" or "fringes" (sinusoids alone), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
+    The kind is "full", "fringes" (sinusoids alone) or "frequencies" (sinusoids, and those of the periods
+    `coarser_mm`), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
     """
-    if kind not in ("full", "fringes"):
-        raise ValueError(f"kind = {kind!r} must be full or fringes")
+    if kind not in ("full", "fringes", "frequencies"):
+        raise ValueError(f"kind = {kind!r} must be full, fringes or frequencies")
     shifts = shifts_rad or tuple(2.0 * np.pi * k / config.steps for k in range(config.steps))
     patterns: list[Pattern] = []
     for axis in ("x", "y"):
         patterns += [Pattern("sin", axis, k, shift) for k, shift in enumerate(shifts)]
         if kind == "full":
             patterns += [Pattern("gray", axis, bit) for bit in range(1, _GRAY_BITS + 1)]
+    patterns += [replace(p, period_mm=period) for period in coarser_mm for p in list(patterns)]
     return patterns + ([Pattern("white"), Pattern("black")] if kind == "full" else [])
 
 

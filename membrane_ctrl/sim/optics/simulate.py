@@ -88,7 +88,8 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
 
 def _mean_um(spec: SimulationSpec) -> float:
     """Mean displacement of the sinusoids."""
-    fringes = [spec.displacement_um(k) for k, pattern in enumerate(spec.patterns) if pattern.role == "sin"]
+    shown = enumerate(spec.patterns)
+    fringes = [spec.displacement_um(k) for k, p in shown if p.role == "sin" and not p.period_mm]
     return float(np.mean(fringes))
 
 
@@ -104,6 +105,8 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
         row |= {"axis": pattern.axis, "index": pattern.index}
     if spec.shifts_rad and pattern.role == "sin":
         row["shift_rad"] = pattern.shift_rad
+    if pattern.period_mm:
+        row["period_mm"] = pattern.period_mm
     row["time_s"] = spec.time_s(frame)
     if spec.laser:
         row["displacement_um"] = reading_um

@@ -83,7 +83,9 @@ class SimulationSpec:
     # the bench as it truly is, with the camera's depth (`bits`) and noise and the pattern's steps
     optics: OpticsConfig
     film: film_shape.FilmShape  # its sag belongs to displacement 0
-    kind: Literal["full", "fringes"] = "full"  # 18 frames (for four steps), or the sinusoids alone
+    # 18 frames (for four steps), the sinusoids alone, or the sinusoids of several periods
+    kind: Literal["full", "fringes", "frequencies"] = "full"
+    coarser_mm: tuple[float, ...] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
     reference: str = ""  # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
     # one phase shift a step, written into each frame; empty: 2 pi k / N, not written
     shifts_rad: tuple[float, ...] = ()
@@ -105,8 +107,14 @@ class SimulationSpec:
     def __post_init__(self) -> None:
         if self.kind == "fringes" and not self.reference:
             raise ValueError("reference: a fringes set needs the full set that anchors it, as ../0000")
-        if self.kind == "full" and self.reference:
+        if self.kind != "fringes" and self.reference:
             raise ValueError("reference: only a fringes set has one")
+        if (self.kind == "frequencies") != bool(self.coarser_mm):
+            raise ValueError("coarser_mm: a set of several frequencies has further periods, any other has none")
+        if any(not isfinite(period) or period <= self.optics.pattern.period_mm for period in self.coarser_mm):
+            raise ValueError(f"coarser_mm: every period must exceed period_mm = {self.optics.pattern.period_mm:g}")
+        if len(set(self.coarser_mm)) < len(self.coarser_mm):
+            raise ValueError("coarser_mm: a period occurs twice")
         if self.shifts_rad and len(self.shifts_rad) != self.optics.pattern.steps:
             raise ValueError(f"shifts_rad: {len(self.shifts_rad)} shifts for steps = {self.optics.pattern.steps}")
         if self.displacements_um and self.motion != Motion():
@@ -132,7 +140,7 @@ class SimulationSpec:
     @property
     def patterns(self) -> list[Pattern]:
         """The patterns, frame by frame."""
-        return shade.pattern_sequence(self.kind, self.optics.pattern, self.shifts_rad)
+        return shade.pattern_sequence(self.kind, self.optics.pattern, self.shifts_rad, self.coarser_mm)
 
     def time_s(self, frame: int) -> float:
         """Start of exposure of a frame on the run's clock."""
