@@ -169,7 +169,7 @@ def simulate(
     interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
     coarser_mm: Annotated[
         list[float] | None,
-        typer.Option(help="Also fringes of this period, longer than the pattern's, instead of Gray codes; repeatable."),
+        typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable."),
     ] = None,
 ) -> int:
     """Simulate a capture set, or a run of sets, with known truth."""

@@ -31,7 +31,6 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
 
-
 _NAMED = 6  # inputs without a stated sigma; the others are counted
 
 

@@ -303,7 +303,7 @@ def _coarser_mm(row: FrameRow, content: CaptureFile, path: Path) -> float:
     if content.kind != "frequencies":
         raise InputError(f"{path}: frames: {row.file} has its own period_mm: the kind of such a set is frequencies")
     if row.period_mm < content.pattern.period_mm:
-        raise InputError(f"{path}: frames: {row.file}: period_mm = {row.period_mm:g}: pattern.period_mm is the finest")
+        raise InputError(f"{path}: frames: {row.file}: period_mm = {row.period_mm:g} is finer than pattern.period_mm")
     return row.period_mm
 
 
