@@ -34,6 +34,7 @@ NAMES = (
     "links",
     "calibration",
     "calibration_time",
+    "coverage",
     "recording",
     "memory",
     "soak",

@@ -377,3 +377,51 @@ def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: P
     details = json.loads((tmp_path / "out" / "details.json").read_text())["sag_sigma_um"]
     assert details["geometry"] < 0.01
     assert "g.toml" in details["geometry_spread"]
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of three fringe periods whose very first coarser frame is too dark."""
+    folder = tmp_path_factory.mktemp("several") / "set"
+    fault = ["--fault", "flicker:x_sin_0_of_55.3mm:0.9"]
+    assert (
+        run(["simulate", str(folder), "--shrink", "12", "--coarser-mm", "55.3", "--coarser-mm", "61.7", *fault]) == 0
+    )
+    return folder
+
+
+def test_a_set_of_several_periods(several: Path, tmp_path: Path) -> None:
+    code, result = measured(several, tmp_path)
+    assert (code, result["quality"]["verdict"]) == (0, "degraded")
+    (flagged,) = result["quality"]["flagged_frames"]
+    assert flagged["file"] == "x_sin_0_of_55.3mm.png"
+    assert flagged["reason"].startswith("does not agree with the other steps")
+    found = np.array(result["zernike"]["coeffs_um"])
+    assert np.hypot(*found[4:6]) == pytest.approx(300, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda table: table.update(kind="fringes", reference="../0"), "its own period_mm"),
+        (lambda table: [row.pop("period_mm", None) for row in table["frames"]], "appears twice"),
+        (lambda table: table["frames"].pop(), "needs y_sin_3_of_61.7mm"),
+        (lambda table: table["frames"][-1].update(period_mm=10.0), "is finer than pattern.period_mm"),
+        (lambda table: table.update(frames=table["frames"][:8]), "needs frames of another period_mm"),
+    ],
+    ids=["kind", "no periods", "a frame is missing", "finer", "one period"],
+)
+def test_a_bad_set_of_several_periods(
+    several: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[dict[str, Any]], object],
+    said: str,
+) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    shutil.copy(several / "capture.toml", folder)
+    rewrite(folder, change)
+    assert run(["measure", str(folder)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert said in line
