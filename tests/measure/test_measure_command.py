@@ -383,10 +383,8 @@ def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: P
 def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of three fringe periods whose very first coarser frame is too dark."""
     folder = tmp_path_factory.mktemp("several") / "set"
-    fault = ["--fault", "flicker:x_sin_0_of_55.3mm:0.9"]
-    assert (
-        run(["simulate", str(folder), "--shrink", "12", "--coarser-mm", "55.3", "--coarser-mm", "61.7", *fault]) == 0
-    )
+    options = ["--coarser-mm", "55.3", "--coarser-mm", "61.7", "--fault", "flicker:x_sin_0_of_55.3mm:0.9"]
+    assert run(["simulate", str(folder), "--shrink", "12", *options]) == 0
     return folder
 
 
