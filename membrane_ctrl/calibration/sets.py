@@ -20,7 +20,7 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
 from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, ring_pose, separable, verdict
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
-from membrane_ctrl.metrology.calibrate.rim import RADIUS_SIGMA_MM, Rim
+from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry

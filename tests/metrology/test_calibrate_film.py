@@ -11,7 +11,7 @@ from calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.propagate import advice, propagate
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
-from membrane_ctrl.metrology.calibrate.rim import Rim
+from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.calibrate.separable import FilmModel, Trust, less_trust
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
 from membrane_ctrl.metrology.calibrate.verdict import after

@@ -4,14 +4,14 @@ The sixth, a turn of everything about z, is unobservable and defines x (`paramet
 from the ring to the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import map_coordinates
-from scipy.optimize import least_squares
 
+from membrane_ctrl.metrology.calibrate import parameters
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
-from membrane_ctrl.metrology.calibrate.rim import EDGE_SIGMA_PX, on_rim
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.reconstruct import HeightFunction
 from membrane_ctrl.model.arrays import FloatArray
@@ -23,6 +23,12 @@ _POINTS = 720
 _REACH_PX = 8.0  # each way from the rough rim
 _STEP_PX = 0.25
 _LEAST_FOUND = 0.5  # of the rim: less is no ellipse
+RADIUS_SIGMA_MM = 0.2
+# A threshold on a blurred edge is off by the blur's asymmetry, which a whole rim may share
+EDGE_SIGMA_PX = 0.1
+_CENTRE_MM = 0.5  # the film's axis, by its clamp, against the edge that is seen
+_OVAL_MM = 0.3  # a welded or turned ring of a metre, each of two directions
+_STEP = 1e-3  # of a parameter's sigma by hand
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,8 @@ def ring_pose(
     def miss_px(x: FloatArray) -> FloatArray:
         return np.asarray((_radii_mm(_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px)
 
+    from scipy.optimize import least_squares  # calibrations without a pose start sooner
+
     fit = least_squares(miss_px, np.zeros(len(POSE_NAMES)), loss="soft_l1", f_scale=0.3)
     slopes, found = np.asarray(fit.jac, float), np.asarray(fit.x, float)
     rms_px = float(np.sqrt(np.mean(miss_px(found) ** 2)))
@@ -88,6 +96,17 @@ def _bench(stated: Geometry, own: FloatArray) -> Geometry:
 
 def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> FloatArray:
     return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
+
+
+def on_rim(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> tuple[FloatArray, FloatArray]:
+    """x and y in mm at which the rays of edges (2, n) meet the rim's height."""
+    rays, z = geometry.rays(*edges), np.zeros(edges.shape[1])
+    x = y = z
+    for _ in range(4):  # the height at the rim hardly changes with the place: each step gains three digits
+        t = (z - geometry.pinhole_mm[2]) / rays[2]
+        x, y = geometry.pinhole_mm[:2, None] + t * rays[:2]
+        z = rim_z(x, y)
+    return x, y
 
 
 def find_edges(light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: float) -> FloatArray | None:
@@ -151,3 +170,60 @@ def _shared(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
 
 def _from_middle(edges: FloatArray) -> FloatArray:
     return np.asarray(edges - edges.mean(axis=1, keepdims=True))
+
+
+# The rim as evidence in the calibration: it shows the size of everything that is seen.
+#
+# Seen from the true bench the radii at which the edges' rays meet the ring are the ring's: their mean, their place
+# and their ovalness are five observations. Their errors are the ring's own and the edge's, which all edges share;
+# the noise of single edges is nothing beside them.
+
+
+@dataclass(frozen=True)
+class Rim:
+    """Edges of the light at the ring."""
+
+    edges_px: FloatArray  # (2, n): column and row
+    radius_mm: float
+    radius_sigma_mm: float = RADIUS_SIGMA_MM
+
+    @classmethod
+    def of(cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float) -> "Rim | None":
+        """The edges of several sets together; None without any."""
+        return cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm) if edges_px else None
+
+    def sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
+        """Normal equations (COMMON + 1, squared) of the five observations at the common unknowns."""
+        now = self._seen_mm(stated, common)
+        columns = [np.zeros(now.size)] * common.size
+        optical = [k for k, name in enumerate(parameters.NAMES[: parameters.OPTICAL]) if name not in _OF_SCREEN]
+        for k in (*optical, *range(len(parameters.NAMES), common.size)):
+            step = _STEP * (parameters.ALL[k].sigma if k < len(parameters.NAMES) else 1.0)
+            there = common.copy()
+            there[k] += step
+            columns[k] = (self._seen_mm(stated, there) - now) / step
+        rows = np.column_stack([*columns, -now]) / self._sigmas_mm(stated)[:, None]
+        return np.asarray(rows.T @ rows)
+
+    def _sigmas_mm(self, stated: Geometry) -> FloatArray:
+        edge_mm = EDGE_SIGMA_PX * float(np.linalg.norm(stated.pinhole_mm)) / stated.focal_px
+        own = np.array([self.radius_sigma_mm, _CENTRE_MM, _CENTRE_MM, _OVAL_MM, _OVAL_MM])
+        return np.asarray(np.hypot(own, edge_mm))
+
+    def _seen_mm(self, stated: Geometry, common: FloatArray) -> FloatArray:
+        """Mean radius less the ring's, place (2,) and ovalness (2,) of the edges."""
+        geometry, ring = parameters.bench_at(stated, common[: len(parameters.NAMES)]).geometry, common[_RING]
+        orders = np.arange(1, ring.size // 2 + 1)
+
+        def height(x: FloatArray, y: FloatArray) -> FloatArray:
+            turns = np.outer(orders, np.arctan2(y, x))
+            return np.asarray(ring[0] + np.concatenate([np.cos(turns), np.sin(turns)]).T @ ring[1:])
+
+        x, y = on_rim(geometry, self.edges_px, height)
+        theta = np.arctan2(y, x)
+        waves = [np.ones_like(theta), np.cos(theta), np.sin(theta), np.cos(2 * theta), np.sin(2 * theta)]
+        return np.asarray(np.linalg.lstsq(np.stack(waves, axis=1), np.hypot(x, y) - self.radius_mm, rcond=None)[0])
+
+
+_RING = slice(len(parameters.NAMES), None)
+_OF_SCREEN = {name for name in parameters.NAMES if name.startswith(("b_", "screen_", "bow_", "pitch_"))}

@@ -7,7 +7,7 @@ import numpy as np
 
 from membrane_ctrl.metrology import reconstruct
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
-from membrane_ctrl.metrology.calibrate.rim import Rim
+from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
