@@ -77,11 +77,11 @@ def test_a_film_of_the_law_is_found_to_the_noise() -> None:
     world = World(scale=6e-4)
     fit = _fit(world.figures(1))
     strain, poisson, stiffness = fit.sigmas
-    assert strain < 4e-6
-    assert poisson < 1e-3
-    assert stiffness < 3e-3
+    assert strain < 1.2e-5
+    assert poisson < 4e-3
+    assert stiffness < 6e-3
     assert np.abs(_z(fit, world)).max() < 3.5
-    assert fit.misfit_um < 1.0
+    assert fit.misfit_um < 2.0  # a micrometre is what the law neglects
     assert not any(wave.seen for wave in fit.waves)
 
 
@@ -89,7 +89,7 @@ def test_without_a_gauge_the_stiffness_is_unknown_and_the_rest_is_not() -> None:
     world = World(gauge=False)
     fit = _fit(world.figures(2))
     assert np.abs(_z(fit, world)[:2]).max() < 3.5
-    assert fit.sigmas[0] < 4e-6
+    assert fit.sigmas[0] < 1.5e-5
     assert fit.sigmas[2] > 10
 
 
