@@ -18,7 +18,7 @@ CLUSTER = """
 import sys
 from distributed import LocalCluster
 if __name__ == "__main__":
-    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0") as cluster:
         print(cluster.scheduler_address, flush=True)
         sys.stdin.read()
 """
@@ -27,7 +27,7 @@ if __name__ == "__main__":
 def figures(folder: Path, out: Path, *options: str) -> dict[str, Any]:
     """uncertainty.json without its times, from a process of its own."""
     command = [sys.executable, "-m", "membrane_ctrl", "uncertainty", str(folder), "--trials", "300", "--seed", "4"]
-    subprocess.run([*command, "--out", str(out), *options], check=True, capture_output=True, timeout=300)
+    subprocess.run([*command, "--out", str(out), *options], check=True, capture_output=True, timeout=1500)
     table: dict[str, Any] = json.loads((out / "uncertainty.json").read_text())
     return table | {"timing_s": None}
 
