@@ -205,8 +205,7 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
     strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
-        f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; uncertainty of the geometry from "
-        f"{table['geometry']}",
+        f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; geometry: {table['geometry']}",
         f"pre-strain {1e6 * strain['value']:.1f} +- {1e6 * strain['sigma']:.2g} um/m",
         f"nu         {poisson['value']:.4f} +- {poisson['sigma']:.2g}",
     ]
