@@ -50,7 +50,7 @@ FLOORS = {
         "membrane_ctrl/replay",
         "membrane_ctrl/review",
     },
-    8: {"membrane_ctrl/cli", "tuning"},
+    8: {"membrane_ctrl/cli", "membrane_ctrl/web", "tuning"},
     9: {"membrane_ctrl/__main__"},
 }
 

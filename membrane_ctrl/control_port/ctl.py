@@ -3,6 +3,7 @@
 import json
 import sys
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ class Where:
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
     """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an answer."""
     action = request["do"]
-    with _connect(where) as client:
+    with connected(where) as client:
         answer = client.ask(**request)
         if not answer.get("ok"):
             if as_json:
@@ -131,10 +132,12 @@ def loop_keys(argument: str) -> dict[str, Any]:
     return tables
 
 
-def _connect(where: Where) -> PortClient:
-    def notice(text: str) -> None:
-        print(f"notice: {text}", file=sys.stderr)
+def _printed(text: str) -> None:
+    print(f"notice: {text}", file=sys.stderr)
 
+
+def connected(where: Where, notice: Callable[[str], None] = _printed) -> PortClient:
+    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no hold answers."""
     if where.tls:
         return _connect_tls(where, notice)
     client = PortClient.unix(socket_path(where), notice)
@@ -144,7 +147,7 @@ def _connect(where: Where) -> PortClient:
     return client
 
 
-def _connect_tls(where: Where, notice: Any) -> PortClient:
+def _connect_tls(where: Where, notice: Callable[[str], None]) -> PortClient:
     host, _, port = where.tls.rpartition(":")
     if not host or not port.isdigit():
         raise errors.InputError(f"--tls {where.tls}: expected HOST:PORT")

@@ -1,0 +1,63 @@
+"""`membrane-ctrl web`: serves the page."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from membrane_ctrl.model import errors, files
+
+app = typer.Typer(
+    invoke_without_command=True,
+    rich_markup_mode="markdown",
+    help="Serve a page that shows the hold and sends commands to it.",
+)
+
+LOCAL = "127.0.0.1"
+
+
+@app.callback()
+def web(
+    context: typer.Context,
+    logs: Annotated[Path, typer.Option("--logs", help="Folder of the runs.")] = Path("logs"),
+    socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
+    run: Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")] = None,
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = LOCAL,
+    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
+    name: Annotated[list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")] = None,
+    users: Annotated[Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")] = None,
+    certificate: Annotated[Path | None, typer.Option("--certificate", help="TLS certificate of the page.")] = None,
+    key: Annotated[Path | None, typer.Option("--key", help="Key of that certificate.")] = None,
+) -> None:
+    """Serve the page until interrupted; without users, print a link that lets its holder in."""
+    if context.invoked_subcommand is not None:
+        return
+    try:
+        from membrane_ctrl.web.server import WebOptions, serve
+    except ModuleNotFoundError as error:
+        if error.name != "nicegui":
+            raise
+        raise errors.InputError("web needs NiceGUI: pip install 'membrane-ctrl[web]'") from None
+    serve(WebOptions(logs, socket, run, host, port, tuple(name or ()), users, certificate, key))
+
+
+@app.command("add-user")
+def add_user(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Users file; created if absent.")],
+    name: Annotated[str, typer.Argument(metavar="NAME")],
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
+) -> None:
+    """Add a user to a users file, or change one; asks for the password."""
+    from membrane_ctrl.web.access import known_user, known_users
+
+    text = files.read_text(file) if file.exists() else ""
+    found = known_users(text, str(file))
+    password = typer.prompt("Password", hide_input=True, confirmation_prompt=sys.stdin.isatty())
+    found[name] = known_user(name, role, password)
+    with errors.writing(file, errors.DeviceError):
+        files.write_text_atomic(file, "".join(f"{each.line()}\n" for each in found.values()))
+        file.chmod(0o600)
+    print(f"{file}: {len(found)} users", file=sys.stderr)

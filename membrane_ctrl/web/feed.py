@@ -1,0 +1,212 @@
+"""Follows one hold for all viewers: its status through the control port, its ticks and figures from the rings.
+
+One connection and one reader serve any number of viewers. The hold never waits for this process: the port drops a
+client that does not read, and a ring overwrites what nobody has taken.
+"""
+
+import math
+import struct
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.console.model import event_words
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.ctl import Where, connected
+from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.processes import ring
+
+PERIOD_S = 0.5  # as fast as people read changing figures
+SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost
+SIGNALS = ("error_um", "displacement_um", "pump_fraction", "leak_um_per_s", "gauge_pressure_pa", "trim_um")
+_KEPT_S = 3600  # of seconds for the chart; the run's tables have the rest
+_EVENTS_KEPT = 200
+_AGAIN_S = 2.0
+
+Message = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Second:
+    """Least, mean and largest value of each signal in one second."""
+
+    utc_s: float
+    values: dict[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class HoldSeen:
+    """What the page knows of a hold at one moment; replaced as a whole."""
+
+    name: str  # of the run; empty before the first contact
+    role: str = "read"  # of this process at the port
+    status: Message = field(default_factory=dict)  # the port's last status
+    seen_s: float = -math.inf  # monotonic time of that status
+    problem: str = "not connected yet"  # why there is no status; empty if there is
+    events: tuple[str, ...] = ()  # newest last
+    figure: shape_estimate.ShapeEstimate | None = None
+    reference: shape_estimate.ShapeEstimate | None = None  # the first usable figure that was seen
+
+    @property
+    def silent(self) -> str:
+        """Why the shown status must not be believed; empty if it may be."""
+        if self.problem:
+            return self.problem
+        age_s = time.monotonic() - self.seen_s
+        return f"no status for {age_s:.0f} s" if age_s > SILENT_S else ""
+
+
+class Seconds:
+    """Collects ticks into seconds for the chart."""
+
+    def __init__(self, kept_s: int = _KEPT_S) -> None:
+        self._done: deque[Second] = deque(maxlen=kept_s)
+        self._open: dict[str, list[float]] = {}
+        self._at = -1
+
+    def add(self, utc_s: float, values: dict[str, float]) -> None:
+        """Add one tick; missing values are left out."""
+        if math.floor(utc_s) != self._at:
+            self._close()
+            self._at = math.floor(utc_s)
+        for name, value in values.items():
+            if math.isfinite(value):
+                self._open.setdefault(name, []).append(value)
+
+    def _close(self) -> None:
+        if self._open:
+            found = {name: (min(v), math.fsum(v) / len(v), max(v)) for name, v in self._open.items()}
+            self._done.append(Second(float(self._at), found))
+        self._open = {}
+
+    def since(self, utc_s: float) -> list[Second]:
+        """The finished seconds from a time on."""
+        return [second for second in list(self._done) if second.utc_s >= utc_s]
+
+
+class HoldFeed:
+    """Follows the hold that `where` names, on a thread of its own, until closed; connects again by itself."""
+
+    def __init__(self, where: Where) -> None:
+        self._where = where
+        self.seen = HoldSeen("")
+        self.seconds = Seconds()
+        self._events: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        self._ending = threading.Event()
+        self._client: PortClient | None = None
+        self._thread = threading.Thread(target=self._follow, name="hold feed", daemon=True)
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the run, if it is on this machine."""
+        if self._where.tls or not self.seen.name:
+            return None
+        return self._where.run or self._where.logs / self.seen.name
+
+    def open(self) -> None:
+        """Start to follow."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop following; returns once the thread has ended, or after a few seconds."""
+        self._ending.set()
+        with suppress(AttributeError, OSError):
+            self._client.close()  # type: ignore[union-attr]
+        self._thread.join(5.0)
+
+    def ask(self, request: Message) -> str:
+        """Send a request on a connection of its own; returns what became of it, in one line."""
+        what = str(request["do"]).replace("_", " ")
+        try:
+            with connected(self._where, notice=lambda _: None) as client:
+                if client.greeting.get("run") != self.seen.name:
+                    return f"{what}: not sent: another run is listening now; look again"
+                answer = client.ask(**request)
+        except errors.CommandError as error:
+            return f"{what}: {'; '.join(error.lines)}"
+        return f"{what}: done" if answer.get("ok") else f"{what} refused: {answer.get('refused')}"
+
+    def _follow(self) -> None:
+        while not self._ending.is_set():
+            try:
+                with connected(self._where, notice=self._events.append) as client:
+                    self._client = client
+                    self._watch(client)
+                    problem = "the run has ended" if self.seen.status else "the connection was closed"
+            except (errors.CommandError, OSError, ValueError, struct.error) as error:
+                problem = str(error)
+            self.seen = replace(self.seen, problem=problem, role="read")
+            self._ending.wait(_AGAIN_S)
+
+    def _watch(self, client: PortClient) -> None:
+        greeting = client.greeting
+        if greeting["run"] != self.seen.name:
+            self.seen = HoldSeen(str(greeting["run"]))
+            self._events.clear()
+        rings = self._rings()
+        client.patience(10 * PERIOD_S)
+        answer = client.ask(do="watch", period_s=PERIOD_S)
+        if not answer.get("ok"):
+            raise errors.DeviceError(f"watch refused: {answer.get('refused')}")
+        try:
+            self._take(answer, greeting, rings)
+            for message in client.messages():
+                self._take(message, greeting, rings)
+                if self._ending.is_set():
+                    return
+        finally:
+            for reader in rings.values():
+                reader.close()
+
+    def _rings(self) -> dict[str, ring.RingReader]:
+        """The rings of a hold on this machine; none if they belong to another user or machine."""
+        folder = self.folder
+        if folder is None:
+            return {}
+        with suppress(OSError, ValueError):
+            return ring.attach(folder)
+        return {}
+
+    def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:
+        if "event" in message:
+            utc = datetime.now(UTC)
+            self._events.append(f"{utc:%H:%M:%S} UTC  {event_words(message['event'])}")
+        if "status" in message:
+            self.seen = replace(
+                self.seen,
+                role=str(greeting["role"]),
+                status=message["status"],
+                seen_s=time.monotonic(),
+                problem="",
+            )
+            self._take_ticks(message["status"].get("row") or {}, rings.get("telemetry"))
+            self._take_figures(rings.get("shapes"))
+        self.seen = replace(self.seen, events=tuple(self._events))
+
+    def _take_ticks(self, newest: Message, reader: ring.RingReader | None) -> None:
+        """Add the ticks since the last status; without a ring, the status's own."""
+        utc_s = time.time()
+        if reader is None:
+            self.seconds.add(utc_s, {name: _number(newest.get(name)) for name in SIGNALS})
+            return
+        rows = telemetry.unpack(reader.drain())
+        if len(rows):
+            ticks = telemetry.columns(rows)
+            at_s = utc_s + ticks["mono_s"] - ticks["mono_s"][-1]
+            for place, tick_s in enumerate(at_s):
+                self.seconds.add(float(tick_s), {name: float(ticks[name][place]) for name in SIGNALS})
+
+    def _take_figures(self, reader: ring.RingReader | None) -> None:
+        for message in reader.drain() if reader else ():
+            figure = shape_estimate.unpack_estimate(message)
+            first = self.seen.reference is None and figure.verdict != "rejected"
+            self.seen = replace(self.seen, figure=figure, reference=figure if first else self.seen.reference)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan

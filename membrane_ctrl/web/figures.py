@@ -1,0 +1,130 @@
+"""What the page draws: options of the charts, the map of the figure, a run's sparkline. Pure."""
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.run_files import shapes
+from membrane_ctrl.web.history import UNITS, Series
+
+REMOVED = {"nothing": 0, "piston, tilt": 3, "piston, tilt, defocus": 4}
+_BAND = {
+    "type": "line", "symbol": "none", "lineStyle": {"opacity": 0}, "silent": True,
+    "stack": "band", "stackStrategy": "all",  # also where its lower edge is negative
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class MapPicture:
+    """A map as a picture for the page, with its figures in words."""
+
+    url: str  # data URL of a PNG
+    words: str
+
+
+def chart(signal: str, series: Series, utc: bool, span_s: float) -> dict[str, Any]:
+    """Options of the history chart (ECharts): the mean, and the band between least and largest value."""
+    shift_ms = 0.0 if utc else _offset_s(series) * 1e3
+    at_ms = series.utc_s * 1e3 + shift_ms
+    low, mean, high = ([[t, _plain(v)] for t, v in zip(at_ms, y, strict=True)] for y in _stacked(series))
+    options: dict[str, Any] = {
+        "animation": False,
+        "useUTC": True,  # the local time is in the values: ECharts knows no time zone of the bench
+        "grid": {"left": 64, "right": 16, "top": 24, "bottom": 64},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "time", "name": "UTC" if utc else "local time", "nameGap": 28, "nameLocation": "middle"},
+        "yAxis": {"type": "value", "scale": True, "name": UNITS[signal], "nameLocation": "middle", "nameGap": 48},
+        "dataZoom": [{"type": "inside"}, {"type": "slider", "height": 18, "bottom": 6}],
+        "series": [
+            {**_BAND, "data": low},
+            {**_BAND, "data": high, "areaStyle": {"color": "#1f77b4", "opacity": 0.25}},
+            {"type": "line", "name": UNITS[signal], "symbol": "none", "data": mean, "lineStyle": {"width": 1.5},
+             "itemStyle": {"color": "#1f77b4"}},
+        ],
+    }  # fmt: skip
+    return options
+
+
+def _stacked(series: Series) -> tuple[Column, Column, Column]:
+    """The band as ECharts stacks it: its lower edge and its width; and the mean."""
+    return series.low, series.mean, series.high - series.low
+
+
+def _offset_s(series: Series) -> float:
+    at_s = float(series.utc_s[-1]) if series.utc_s.size else 0.0
+    offset = datetime.fromtimestamp(at_s, UTC).astimezone().utcoffset()
+    return offset.total_seconds() if offset else 0.0
+
+
+def _plain(value: float) -> float | None:
+    return round(float(value), 4) if math.isfinite(value) else None
+
+
+def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
+    """Options of the bar chart of Noll 4..36, as change since the reference, um, with its standard deviation."""
+    change_um = figure.coeffs_um - reference.coeffs_um if reference is not None else figure.coeffs_um
+    sigma_um = np.sqrt(np.diag(figure.covariance_um2))
+    return {
+        "animation": False,
+        "grid": {"left": 56, "right": 12, "top": 16, "bottom": 40},
+        "tooltip": {"trigger": "axis"},
+        "xAxis": {"type": "category", "data": [f"Z{j}" for j in range(4, 37)]},
+        "yAxis": {"type": "value", "name": "um"},
+        "series": [
+            {"type": "bar", "name": "change, um", "data": [_plain(v) for v in change_um[3:]]},
+            {"type": "scatter", "name": "sigma, um", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[3:]]},
+        ],
+    }
+
+
+def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed: int) -> MapPicture:
+    """The figure less `removed` terms: its change since the reference in um, without one its height in um."""
+    from matplotlib import colormaps
+    from PIL import Image
+
+    change = reference is not None and reference is not figure
+    height_um = (
+        shapes.difference_map_um(figure, reference)
+        if change and reference is not None
+        else shapes.height_map_mm(figure) * 1e3
+    )
+    left = shapes.without_terms(height_um, removed) if removed else height_um
+    there = np.isfinite(left)
+    values = left[there].astype(np.float64)
+    scale_um = max(float(np.abs(values).max()), 1e-6)
+    share = np.where(there, 0.5 + 0.5 * left / scale_um, 0.5)
+    picture = (colormaps["RdBu_r"](share) * 255).astype(np.uint8)
+    picture[~there, 3] = 0
+    file = io.BytesIO()
+    Image.fromarray(picture).resize((384, 384), Image.Resampling.NEAREST).save(file, "PNG")
+    of = "change since the reference" if change else "height above the vertex"
+    words = f"{of}: {values.max() - values.min():.3g} um PV, {values.std():.3g} um rms, scale +-{scale_um:.3g} um"
+    return MapPicture("data:image/png;base64," + base64.b64encode(file.getvalue()).decode(), words)
+
+
+def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
+    """A small SVG line; gaps where values are missing."""
+    y = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(y)
+    if known.sum() < 2:
+        return ""
+    low, high = y[known].min(), y[known].max()
+    rows = height - 3 - (y - low) / max(high - low, 1e-12) * (height - 6)
+    columns = np.arange(y.size) * width / max(y.size - 1, 1)
+    path = " ".join(
+        f"{'L' if place and known[place - 1] else 'M'}{column:.1f},{row:.1f}"
+        for place, (column, row) in enumerate(zip(columns, rows, strict=True))
+        if known[place]
+    )
+    return (
+        f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" role="img">'
+        f'<path d="{path}" fill="none" stroke="currentColor" stroke-width="1.2"/></svg>'
+    )

@@ -1,0 +1,214 @@
+"""The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs before it."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from membrane_ctrl.web import figures
+from membrane_ctrl.web.access import WebUser
+from membrane_ctrl.web.actions import ACTIONS, STOP, Action, may, request
+from membrane_ctrl.web.feed import SIGNALS, HoldFeed
+from membrane_ctrl.web.history import SPANS_S, UNITS, history
+from membrane_ctrl.web.runs import runs_panel
+from membrane_ctrl.web.sessions import tuning_panel
+
+_LOOK_S = 0.5
+_CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
+_FIGURES = (
+    ("error", "error_um", "um", 2), ("setpoint", "setpoint_um", "um", 2), ("laser", "displacement_um", "um", 2),
+    ("pump", "pump_fraction", "", 3), ("leak", "leak_um_per_s", "um/s", 3), ("trim", "trim_um", "um", 2),
+    ("gauge pressure", "gauge_pressure_pa", "Pa", 1), ("ambient", "ambient_pressure_pa", "Pa", 0),
+    ("air", "air_temperature_c", "°C", 2), ("gas", "gas_temperature_c", "°C", 2), ("late", "lateness_ms", "ms", 1),
+    ("missed ticks", "missed_ticks", "", 0),
+)  # fmt: skip
+_COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
+
+
+class Page:
+    """The elements of a viewer's page, and what it is set to show."""
+
+    def __init__(self, feeds: Sequence[HoldFeed], logs: Path, user: WebUser) -> None:
+        self._feeds, self._logs, self._user = feeds, logs, user
+        self._feed = feeds[0]
+        self._utc = True
+        self._span, self._signal = "10 min", SIGNALS[0]
+        self._removed = "nothing"
+        self._charted_s = -1e9
+        self._drawn: tuple[float, str] = (0.0, "")
+        self._buttons: list[tuple[ui.button, Action]] = []
+
+    def build(self) -> None:
+        """Put the page together."""
+        self._dark = ui.dark_mode(None)
+        with ui.header().classes("items-center justify-between q-py-xs"):
+            self._name = ui.label().classes("text-h6")
+            self._state = ui.badge().classes("text-body1 q-pa-sm").props('aria-label="state"')
+            with ui.row().classes("items-center"):
+                ui.switch("UTC", value=True, on_change=lambda e: self._set("_utc", e.value)).props(
+                    "color=dark keep-color"
+                )
+                ui.button(icon="dark_mode", on_click=self._toggle_dark).props(
+                    'flat round color=white aria-label="dark"'
+                )
+                ui.label(f"{self._user.name} ({self._user.role})").classes("text-caption")
+        with ui.tabs().classes("w-full") as tabs:
+            now, look_back, tune = ui.tab("Now"), ui.tab("Look back"), ui.tab("Tune")
+        with ui.tab_panels(tabs, value=now).classes("w-full"):
+            with ui.tab_panel(now):
+                self._build_now()
+            with ui.tab_panel(look_back):
+                runs_panel(self._logs, lambda: self._utc)
+            with ui.tab_panel(tune):
+                tuning_panel(self._logs)
+        ui.keyboard(on_key=self._key)
+        ui.timer(_LOOK_S, self._look)
+
+    def _build_now(self) -> None:
+        self._why = ui.label().classes("text-subtitle1").props('role="status"')
+        self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
+        with ui.row().classes("w-full items-stretch no-wrap max-lg:flex-wrap"):
+            with ui.column().classes("col-grow"):
+                self._numbers = self._build_numbers()
+                self._build_chart()
+            with ui.column().style("width: 24rem; max-width: 100%"):
+                self._build_actions()
+                self._build_figure()
+        self._events = ui.log(max_lines=200).classes("w-full h-48").props('aria-label="events"')
+        self._shown_events: tuple[str, ...] = ()
+
+    def _build_numbers(self) -> dict[str, ui.label]:
+        found = {}
+        with ui.grid().classes("w-full gap-2").style("grid-template-columns: repeat(auto-fill, minmax(8.5rem, 1fr))"):
+            for name, field, unit, _ in _FIGURES:
+                with ui.card().classes("q-pa-sm gap-0"):
+                    ui.label(f"{name}{f', {unit}' if unit else ''}").classes("text-caption")
+                    found[field] = ui.label("-").classes("text-h6").props(f'data-field="{field}"')
+        return found
+
+    def _build_chart(self) -> None:
+        with ui.row().classes("items-center"):
+            ui.toggle(list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)).props("dense")
+            ui.select(
+                dict(zip(SIGNALS, (UNITS[name] for name in SIGNALS), strict=True)), value=self._signal,
+                on_change=lambda e: self._set("_signal", e.value),
+            ).props('dense aria-label="signal"')  # fmt: skip
+        self._chart = ui.echart({"series": []}).classes("w-full").style("height: 22rem")
+
+    def _build_actions(self) -> None:
+        with ui.grid(columns=3).classes("w-full gap-1"):
+            for action in ACTIONS:
+                button = ui.button(action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a))
+                button.props("dense no-caps").tooltip(action.does)
+                self._buttons.append((button, action))
+        stop = ui.button(STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP))
+        stop.classes("w-full text-h6").tooltip(STOP.does)
+        self._buttons.append((stop, STOP))
+
+    def _build_figure(self) -> None:
+        with ui.row().classes("items-center"):
+            ui.label("figure without")
+            ui.select(
+                list(figures.REMOVED), value=self._removed, on_change=lambda e: self._set("_removed", e.value)
+            ).props('dense aria-label="terms to remove"')
+        self._map = ui.image().classes("w-full").style("max-width: 24rem; aspect-ratio: 1").props('alt="figure"')
+        self._map_words = ui.label("no figure yet").classes("text-caption")
+        self._terms = ui.echart({"series": []}).classes("w-full").style("height: 12rem")
+
+    def _toggle_dark(self) -> None:
+        """From the system's choice to dark, then to light and back."""
+        self._dark.set_value(not self._dark.value)
+
+    def _set(self, name: str, value: object) -> None:
+        setattr(self, name, value)
+        self._charted_s, self._drawn = -1e9, (0.0, "")
+
+    async def _look(self) -> None:
+        """Show what is new."""
+        seen = self._feed.seen
+        self._show_status()
+        if seen.events != self._shown_events:
+            known = len(self._shown_events) if seen.events[: len(self._shown_events)] == self._shown_events else 0
+            for line in seen.events[known:]:
+                self._events.push(line)
+            self._shown_events = seen.events
+        if seen.figure is not None and self._drawn != (seen.figure.time_s, self._removed):
+            self._drawn = (seen.figure.time_s, self._removed)
+            picture = await asyncio.to_thread(
+                figures.map_picture, seen.figure, seen.reference, figures.REMOVED[self._removed]
+            )
+            self._map.set_source(picture.url)
+            self._map_words.set_text(f"{seen.figure.verdict}; {picture.words}")
+            self._terms.options.clear()
+            self._terms.options.update(figures.terms_chart(seen.figure, seen.reference))
+        span_s = SPANS_S[self._span]
+        if time.monotonic() - self._charted_s > _CHART_EVERY_S.get(span_s, 60.0):
+            self._charted_s = time.monotonic()
+            series = await asyncio.to_thread(history, self._feed, self._logs, self._signal, span_s)
+            self._chart.run_chart_method("setOption", figures.chart(self._signal, series, self._utc, span_s))
+
+    def _show_status(self) -> None:
+        seen = self._feed.seen
+        status, row = seen.status, seen.status.get("row") or {}
+        silent = seen.silent
+        state = "no contact" if silent else str(status.get("state", "-"))
+        self._name.set_text(seen.name or "no hold")
+        self._state.set_text(state)
+        self._state.props(f"color={'grey' if silent else _COLOURS.get(state, 'warning')}")
+        self._why.set_text(silent or str(status.get("why") or "as it should be"))
+        self._alarm.set_text(_alarms(status))
+        for _, field, _, digits in _FIGURES:
+            value = row.get(field)
+            self._numbers[field].set_text("-" if value is None or silent else f"{value:z.{digits}f}")
+        for button, action in self._buttons:
+            allowed = not silent and may(self._user, seen.role, action) and state in action.states
+            if button.enabled != allowed:
+                button.set_enabled(allowed)
+
+    async def _key(self, event: Any) -> None:
+        """The console's keys: h, p, m, s."""
+        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
+            return
+        why = str(self._feed.seen.status.get("why", ""))
+        wanted = {"h": "hold", "p": "resume" if "pause" in why else "pause", "m": "mark", "s": "stop"}
+        action = next((a for a in (*ACTIONS, STOP) if a.do == wanted.get(str(event.key))), None)
+        if action is not None and may(self._user, self._feed.seen.role, action):
+            await self._confirm(action)
+
+    async def _confirm(self, action: Action) -> None:
+        """Ask for the input and for a confirmation, send, and say what became of it."""
+        with ui.dialog() as dialog, ui.card():
+            ui.label(action.label).classes("text-h6")
+            ui.label(action.does)
+            given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").props("autofocus")
+            given.set_visibility(bool(action.asks))
+            given.on("keydown.enter", lambda: dialog.submit("yes"))
+            take_over = ui.checkbox("take command from whoever has it")
+            with ui.row():
+                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
+                ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
+        answer = await dialog
+        dialog.delete()
+        if not answer:
+            return
+        if not may(self._user, self._feed.seen.role, action):  # the role may have changed while the dialog was open
+            ui.notify(f"{action.label}: needs the role {action.role}", type="negative")
+            return
+        try:
+            asked = request(action, self._user, str(given.value or ""), bool(take_over.value))
+        except ValueError as error:
+            ui.notify(str(error), type="negative")
+            return
+        said = await asyncio.to_thread(self._feed.ask, asked)
+        ui.notify(said, type="positive" if said.endswith(": done") else "negative", timeout=8000)
+
+
+def _alarms(status: dict[str, Any]) -> str:
+    """The fault, the maintenance notices and what the recording lacks, in one line."""
+    fault = status.get("fault")
+    lines = [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
+    lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    return "; ".join(lines)

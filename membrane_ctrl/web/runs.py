@@ -1,0 +1,124 @@
+"""Look back: the runs as a table with sparklines, their reports, and their timelines in Rerun."""
+
+import asyncio
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from nicegui import ui
+
+from membrane_ctrl.review import catalogue
+from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.web.figures import sparkline
+
+_POINTS = 80
+_MOST = 200  # runs in the table, newest first
+_REPORT = "report.html"
+
+
+@dataclass(frozen=True, slots=True)
+class RunLine:
+    """A run's line of the table."""
+
+    entry: catalogue.RunEntry
+    picture: str  # its error over time, as SVG
+
+
+def run_lines(logs: Path) -> list[RunLine]:
+    """The runs of a folder, newest first."""
+    if not logs.is_dir():
+        return []
+    entries = sorted(catalogue.entries(logs), key=lambda entry: entry.started_utc, reverse=True)[:_MOST]
+    return [RunLine(entry, _picture(entry.folder, entry.exit != "open" and entry.duration_s)) for entry in entries]
+
+
+@lru_cache(maxsize=4 * _MOST)
+def _picture(folder: Path, ended: float | bool) -> str:
+    """The error over the run; kept for runs that have ended, which no longer change."""
+    try:
+        level = open_run(folder).level(60.0, names=("mean_error_um",))
+    except (OSError, ValueError):
+        return ""
+    values = level["mean_error_um"]
+    if values.size > _POINTS:
+        values = np.array([part.mean() for part in np.array_split(values, _POINTS)])
+    return sparkline(values)
+
+
+def runs_panel(logs: Path, utc: Callable[[], bool]) -> None:
+    """Fill the tab."""
+    columns = [
+        {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
+        for name, label in (
+            ("run", "run"), ("started", "started"), ("hours", "h"), ("std", "std, um"), ("faults", "faults"),
+            ("exit", "end"), ("marks", "marks"), ("error", "error"),
+        )
+    ]  # fmt: skip
+    table = ui.table(columns=columns, rows=[], row_key="run", selection="single", pagination=20).classes("w-full")
+    table.add_slot("body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>')
+
+    async def load() -> None:
+        table.rows = [_cells(line, utc()) for line in await asyncio.to_thread(run_lines, logs)]
+        table.update()
+
+    def chosen() -> Path | None:
+        if not table.selected:
+            ui.notify("Select a run first.")
+            return None
+        return logs / str(table.selected[0]["run"])
+
+    async def report() -> None:
+        folder = chosen()
+        if folder is None:
+            return
+        if not (folder / _REPORT).exists():
+            ui.notify("Writing the report.")
+            said = await asyncio.to_thread(_command, "report", str(folder))
+            if said:
+                ui.notify(said, type="negative", timeout=10_000)
+                return
+        ui.navigate.to(f"/report/{folder.name}", new_tab=True)
+
+    async def review() -> None:
+        folder = chosen()
+        if folder is not None:
+            ui.clipboard.write(f"membrane-ctrl review {folder}")
+            ui.notify("Copied the command that opens this run in Rerun; run it on your desktop.")
+
+    with ui.row():
+        ui.button("Refresh", icon="refresh", on_click=load).props("flat")
+        ui.button("Report", icon="description", on_click=report).props("flat")
+        ui.button("Open in Rerun", icon="timeline", on_click=review).props("flat")
+    ui.timer(0.1, load, once=True)
+
+
+def _cells(line: RunLine, utc: bool) -> dict[str, object]:
+    entry = line.entry
+    started = entry.started_utc if utc else entry.started_utc.astimezone()
+    return {
+        "run": entry.name,
+        "started": f"{started:%Y-%m-%d %H:%M}",
+        "hours": _rounded(entry.duration_s / 3600, 2),
+        "std": _rounded(entry.std_um, 3),
+        "faults": entry.faults,
+        "exit": entry.exit,
+        "marks": entry.marks,
+        "error": line.picture,
+    }
+
+
+def _rounded(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _command(*arguments: str) -> str:
+    """Run one of our own commands; returns its last line if it failed."""
+    done = subprocess.run(
+        [sys.executable, "-m", "membrane_ctrl", *arguments], capture_output=True, text=True, check=False
+    )
+    return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["it failed"])[-1]

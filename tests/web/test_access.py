@@ -1,0 +1,188 @@
+"""Nobody sees the page or reaches the hold through it without a link or a password, from this page and no other."""
+
+from __future__ import annotations
+
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.web import access
+from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_user, known_users
+
+HOSTS = frozenset({"127.0.0.1", "localhost"})
+HOST = "127.0.0.1:7480"
+
+
+class Site:
+    """An application behind the login that notes who came in."""
+
+    def __init__(self, accounts: Accounts) -> None:
+        self.seen: list[WebUser] = []
+        self._gate = LoginMiddleware(self._app, accounts, HOSTS)
+
+    async def _app(self, scope: Any, receive: Any, send: Any) -> None:
+        self.seen.append(scope["membrane_user"])
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"in"})
+
+    async def ask(
+        self, path: str = "/", query: str = "", body: bytes | None = None, kind: str = "http", **headers: str
+    ) -> tuple[int, dict[str, str]]:
+        """Status (for a web socket, its close code) and headers of the answer."""
+        given = {"host": HOST, **{name.replace("_", "-"): value for name, value in headers.items()}}
+        scope = {
+            "type": kind, "method": "GET" if body is None else "POST", "path": path, "query_string": query.encode(),
+            "headers": [(name.encode(), value.encode()) for name, value in given.items()],
+        }  # fmt: skip
+        sent: list[dict[str, Any]] = []
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": body or b""}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        await self._gate(scope, receive, send)
+        first = sent[0]
+        answered = {name.decode(): value.decode() for name, value in first.get("headers", ())}
+        return int(first.get("status") or first["code"]), answered
+
+
+def cookie_of(headers: dict[str, str]) -> str:
+    return headers["set-cookie"].partition(";")[0]
+
+
+async def test_the_link_lets_in_and_its_session_stays() -> None:
+    accounts = Accounts({})
+    site = Site(accounts)
+    assert (await site.ask())[0] == 401
+    assert (await site.ask(query="key=wrong"))[0] == 401
+    status, headers = await site.ask(query=f"key={accounts.secret}")
+    assert status == 303
+    assert headers["location"] == "/"
+    assert {"HttpOnly", "SameSite=Strict"} <= {part.strip() for part in headers["set-cookie"].split(";")}
+    assert site.seen == []
+    assert (await site.ask(cookie=cookie_of(headers)))[0] == 200
+    assert [user.role for user in site.seen] == ["tune"]
+
+
+async def test_a_session_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    accounts = Accounts({})
+    site = Site(accounts)
+    key = accounts.session(WebUser("a", "read"))
+    now = time.monotonic()
+    assert (await site.ask(cookie=f"membrane_ctrl={key}"))[0] == 200
+    monkeypatch.setattr("time.monotonic", lambda: now + access.SESSION_S + 10.0)
+    assert (await site.ask(cookie=f"membrane_ctrl={key}"))[0] == 401
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"host": "evil.example:7480"},  # DNS rebinding: the browser was told that this name is 127.0.0.1
+        {"origin": "http://evil.example"},
+        {"origin": "http://127.0.0.1:9999"},  # another server on this machine
+        {"origin": "null"},
+        {"host": ""},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+async def test_other_pages_are_refused_even_with_the_cookie(kind: str, headers: dict[str, str]) -> None:
+    accounts = Accounts({})
+    site = Site(accounts)
+    key = accounts.session(WebUser("a", "operate"))
+    status, _ = await site.ask("/", "", None, kind, cookie=f"membrane_ctrl={key}", **headers)
+    assert status in (403, 4403)
+    assert site.seen == []
+    status, _ = await site.ask(kind=kind, cookie=f"membrane_ctrl={key}", origin=f"http://{HOST}")
+    assert len(site.seen) == 1
+
+
+async def test_a_web_socket_without_a_session_is_closed() -> None:
+    site = Site(Accounts({}))
+    assert (await site.ask(kind="websocket", origin=f"http://{HOST}"))[0] == 4403
+    assert site.seen == []
+
+
+async def test_names_and_passwords() -> None:
+    users = {"anna": known_user("anna", "operate", "membrane!"), "bob": known_user("bob", "read", "password")}
+    accounts = Accounts(users, secure=True)
+    site = Site(accounts)
+    assert (await site.ask(query=f"key={accounts.secret}"))[0] == 401, "with users, the link lets nobody in"
+    for body in (b"name=anna&password=wrong", b"name=nobody&password=membrane!", b"", b"name=anna", b"x" * 5000):
+        assert (await site.ask("/login", body=body))[0] == 401
+    status, headers = await site.ask("/login", body=b"name=anna&password=membrane%21")
+    assert status == 303
+    assert "Secure" in headers["set-cookie"]
+    assert (await site.ask(cookie=cookie_of(headers)))[0] == 200
+    assert site.seen == [WebUser("anna", "operate")]
+
+
+def test_guessing_is_slowed_for_the_name_that_is_guessed(monkeypatch: pytest.MonkeyPatch) -> None:
+    users = {"anna": known_user("anna", "operate", "membrane!"), "bob": known_user("bob", "read", "password")}
+    accounts = Accounts(users)
+    for _ in range(5):
+        assert accounts.by_password("anna", "wrong") is None
+    assert accounts.by_password("anna", "membrane!") is None
+    assert accounts.by_password("bob", "password") is not None
+    now = time.monotonic()
+    monkeypatch.setattr("time.monotonic", lambda: now + 61.0)
+    assert accounts.by_password("anna", "membrane!") == WebUser("anna", "operate")
+
+
+def test_sessions_do_not_grow_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "_SESSIONS_MAX", 3)
+    accounts = Accounts({})
+    keys = [accounts.session(WebUser(str(number), "read")) for number in range(5)]
+    assert [accounts.user(key) is not None for key in keys] == [False, False, True, True, True]
+
+
+def test_a_users_file_is_read_back_and_holds_no_password() -> None:
+    user = known_user("anna", "operate", "membrane!")
+    assert "membrane!" not in user.line()
+    assert known_users(f"# the lab\n\n{user.line()}\n", "users") == {"anna": user}
+    assert known_user("anna", "operate", "membrane!").digest != user.digest, "salted"
+
+
+@pytest.mark.parametrize(
+    "line", ["anna", "anna:operate:zz:00", "anna:king:00:00", "anna:operate:00", ":" * 9, "\0:read:00:00:"]
+)
+def test_a_damaged_users_file_is_named_with_its_line(line: str) -> None:
+    with pytest.raises(InputError, match=r"users, line 2: expected NAME:ROLE:SALT:HASH"):
+        known_users(f"# first\n{line}\n", "users")
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "password", "says"),
+    [
+        ("", "read", "long enough", "1 to 32 printable"),
+        ("a:b", "read", "long enough", "colon"),
+        ("a\nb", "read", "long enough", "printable"),
+        ("a", "root", "long enough", "one of read, operate, tune"),
+        ("a", "read", "short", "at least 8"),
+    ],
+)
+def test_a_user_that_cannot_be(name: str, role: str, password: str, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        known_user(name, role, password)
+
+
+def test_add_user_writes_a_file_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from typer.testing import CliRunner
+
+    from membrane_ctrl.web.cli import app
+
+    file = tmp_path / "users"
+    for name, password in (("anna", "membrane!"), ("bob", "password"), ("anna", "changed it")):
+        done = CliRunner().invoke(app, ["add-user", str(file), name, "operate"], input=f"{password}\n")
+        assert done.exit_code == 0, done.output
+    found = Accounts(known_users(file.read_text(), str(file)))
+    assert found.by_password("anna", "changed it") == WebUser("anna", "operate")
+    assert found.by_password("anna", "membrane!") is None
+    assert found.by_password("bob", "password") is not None
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600

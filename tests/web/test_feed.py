@@ -1,0 +1,95 @@
+"""The feed follows a port that is real, whatever becomes of it; buttons ask for what the viewer may ask."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.protocol import encode, parse
+from membrane_ctrl.controller.commands import TABLE
+from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.web.access import WebUser
+from membrane_ctrl.web.actions import ACTIONS, STOP, may, request
+from membrane_ctrl.web.feed import HoldFeed
+from tests.control_port.port_run import ROW, port_run
+
+_LOOK_S = 0.02
+
+
+async def until(true: Callable[[], object]) -> None:
+    async with asyncio.timeout(20.0):
+        while not true():  # noqa: ASYNC110
+            await asyncio.sleep(_LOOK_S)
+
+
+async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
+    feed = HoldFeed(Where(socket=tmp_path / "control.sock"))
+    assert feed.seen.silent
+    feed.open()
+    try:
+        async with port_run(tmp_path) as run:
+            await until(lambda: not feed.seen.silent)
+            assert feed.seen.name == "the-run"
+            assert feed.seen.status["row"]["error_um"] == ROW.error_um
+            assert feed.seen.role == "tune"
+            said = await asyncio.to_thread(feed.ask, {"do": "pause", "why": "web: anna"})
+            assert said == "pause: done"
+            assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: anna")]
+            refused = await asyncio.to_thread(feed.ask, {"do": "setpoint", "value": 1e9})
+            assert refused.startswith("setpoint refused: setpoint 1e+09 um is outside the limits")
+            run.port.told(Mark("door <b>opened</b>", "anna"))
+            await until(lambda: any("door" in line for line in feed.seen.events))
+        await until(lambda: feed.seen.silent)
+        assert not may(WebUser("anna", "tune"), feed.seen.role, STOP), "no role without a port"
+        async with port_run(tmp_path):
+            await until(lambda: not feed.seen.silent)
+    finally:
+        await asyncio.to_thread(feed.close)
+    assert not feed._thread.is_alive()
+
+
+async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path) -> None:
+    feed = HoldFeed(Where(socket=tmp_path / "control.sock"))
+    feed.seen = dataclasses.replace(feed.seen, name="an-earlier-run")
+    async with port_run(tmp_path) as run:
+        said = await asyncio.to_thread(feed.ask, {"do": "stop"})
+        assert "another run" in said
+        assert run.asked == []
+
+
+async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
+    feed = HoldFeed(Where(socket=tmp_path / "none.sock"))
+    assert "no hold is listening" in await asyncio.to_thread(feed.ask, {"do": "hold"})
+
+
+def test_every_action_is_one_that_the_port_reads() -> None:
+    given = {"number": "3,5", "text": "why not", "": ""}
+    for action in (*ACTIONS, STOP):
+        asked = request(action, WebUser("anna", "tune"), given[action.asks])
+        read = parse(encode({**asked, "number": 1}))
+        assert read.do == action.do
+        assert read.why == "web: anna"
+    offered = {action.do for action in (*ACTIONS, STOP)}
+    assert set(TABLE) - offered == {"gains", "tune"}, "these take a file: they are not for a button"
+
+
+@pytest.mark.parametrize(
+    ("user", "port", "allowed"),
+    [("tune", "tune", True), ("read", "tune", False), ("tune", "read", False), ("operate", "operate", True)],
+)
+def test_the_lesser_of_both_roles_counts(user: str, port: str, allowed: bool) -> None:
+    assert may(WebUser("anna", user), port, STOP) is allowed  # type: ignore[arg-type]
+    keep = next(action for action in ACTIONS if action.do == "keep")
+    assert may(WebUser("anna", "operate"), "tune", keep) is False
+
+
+@pytest.mark.parametrize("text", ["", "x", "nan", "inf", "1e999", "1;2"])
+def test_what_is_no_number_is_not_sent(text: str) -> None:
+    setpoint = next(action for action in ACTIONS if action.do == "setpoint")
+    with pytest.raises(ValueError, match="Setpoint: enter a"):
+        request(setpoint, WebUser("anna", "operate"), text)

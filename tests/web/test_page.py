@@ -1,0 +1,117 @@
+"""The page in a real browser, on a port that is real: what a viewer sees, sends, and cannot be made to do."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.web import server
+from tests.control_port.port_run import PortRun, port_run
+from tests.support.browser import CHROMIUM, Tab, browser_tab
+
+_START_S = 60.0
+HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return int(listener.getsockname()[1])
+
+
+@asynccontextmanager
+async def served(folder: Path, *options: str) -> AsyncIterator[str]:
+    """`membrane-ctrl web` on a folder of runs; yields the link that it prints."""
+    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", "from membrane_ctrl.web.cli import app; app()", "--logs", str(folder),
+        "--port", str(free_port()), *options, stderr=asyncio.subprocess.PIPE, env=env,
+    )  # fmt: skip
+    try:
+        assert process.stderr is not None
+        async with asyncio.timeout(_START_S):
+            line = (await process.stderr.readline()).decode()
+        assert line.startswith("membrane-ctrl web: open http"), line
+        yield line.split()[-1]
+    finally:
+        process.terminate()
+        await process.wait()
+
+
+async def ticking(run: PortRun) -> None:
+    """A row every fifth of a second, as a hold would send."""
+    while True:
+        run.tick()
+        await asyncio.sleep(0.2)
+
+
+@asynccontextmanager
+async def viewed(tmp_path: Path, *options: str) -> AsyncIterator[tuple[PortRun, Tab]]:
+    """A hold, the page of it, and a browser that has opened its link."""
+    async with port_run(tmp_path) as run, served(tmp_path, *options) as link:
+        task = asyncio.create_task(ticking(run))
+        try:
+            await asyncio.sleep(1.0)
+            async with browser_tab(link, tmp_path / "profile") as tab:
+                await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
+                yield run, tab
+        finally:
+            task.cancel()
+
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+
+
+@needs_browser
+@pytest.mark.real_time
+async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
+    async with viewed(tmp_path) as (run, tab):
+        assert "the-run" in await tab.value("document.body.innerText")
+        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause')).click()")
+        await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+        assert run.asked == [], "nothing is sent before the confirmation"
+        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.trim() === 'DO IT').click()")
+        await tab.until("document.body.innerText.includes('pause: done')")
+        assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: link")]
+        run.port.told(Mark(HOSTILE, "anna"))
+        await tab.until("document.body.innerText.includes('onerror')")
+        assert await tab.value("document.title") == "membrane_ctrl"
+        await tab.screenshot(tmp_path / "page.png")
+
+
+def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
+    options = server.WebOptions(tmp_path, None, None, "0.0.0.0", 7480, (), None, None, None)  # noqa: S104
+    with pytest.raises(InputError, match="other machines need TLS and a login"):
+        server.accounts_of(options)
+    assert server.accounts_of(replace(options, host="127.0.0.1")).users == {}
+    empty = tmp_path / "users"
+    empty.write_text("")
+    with pytest.raises(InputError, match="no users; add one with"):
+        server.accounts_of(replace(options, users=empty))
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "../secret", "a/b", ".hidden"])
+def test_a_report_is_that_of_a_run_in_the_folder(tmp_path: Path, name: str) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "report.html").write_text("secret")
+    (tmp_path / "logs" / "report.html").write_text("secret")
+    assert b"secret" not in bytes(server.report_page(tmp_path / "logs", name).body)
+
+
+def test_a_report_of_a_stranger_runs_in_a_sandbox(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.html").write_text("<script>fetch('/')</script>")
+    answer = server.report_page(tmp_path, "run")
+    policy = answer.headers["content-security-policy"]
+    assert policy.startswith("sandbox")
+    assert "allow-same-origin" not in policy
+    assert server.report_page(tmp_path, "none").status_code == 404
