@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from membrane_ctrl.controller.commands import TABLE, Kind, Role
+from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.web.access import WebUser
 
 _RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
@@ -36,9 +36,7 @@ class Action:
     @property
     def states(self) -> frozenset[str]:
         """States in which the hold obeys, in lower case; all for `quiet`."""
-        from membrane_ctrl.model.states import State
-
-        return frozenset(state.name.lower() for state in (State if self.do == "quiet" else TABLE[self.do].states))
+        return frozenset(state.name.lower() for state in (ANY if self.do == "quiet" else TABLE[self.do].states))
 
 
 STOP = Action("stop", "STOP", "stop_circle")

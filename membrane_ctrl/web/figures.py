@@ -13,7 +13,7 @@ import numpy as np
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files import shapes
-from membrane_ctrl.web.history import UNITS, Series
+from membrane_ctrl.web.feed import UNITS, Series
 
 REMOVED = {"nothing": 0, "piston, tilt": 3, "piston, tilt, defocus": 4}
 _BAND = {

@@ -11,10 +11,8 @@ from nicegui import ui
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import WebUser
 from membrane_ctrl.web.actions import ACTIONS, STOP, Action, may, request
-from membrane_ctrl.web.feed import SIGNALS, HoldFeed
-from membrane_ctrl.web.history import SPANS_S, UNITS, history
-from membrane_ctrl.web.runs import runs_panel
-from membrane_ctrl.web.sessions import tuning_panel
+from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
+from membrane_ctrl.web.panels import runs_panel, tuning_panel
 
 _LOOK_S = 0.5
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
@@ -28,7 +26,7 @@ _FIGURES = (
 _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
 
 
-class Page:
+class WebPage:
     """The elements of a viewer's page, and what it is set to show."""
 
     def __init__(self, feeds: Sequence[HoldFeed], logs: Path, user: WebUser) -> None:

@@ -12,7 +12,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
 from membrane_ctrl.web.feed import HoldFeed
-from membrane_ctrl.web.page import Page
+from membrane_ctrl.web.page import WebPage
 
 _LOCAL = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_BYTES_MAX = 64_000_000
@@ -63,7 +63,7 @@ def serve(options: WebOptions) -> None:
     @ui.page("/", title="membrane_ctrl")
     def page(request: Request) -> None:
         user: WebUser = request.scope["membrane_user"]
-        Page([feed], options.logs, user).build()
+        WebPage([feed], options.logs, user).build()
 
     @app.get("/report/{name}")
     def report(name: str) -> HTMLResponse:

@@ -9,8 +9,7 @@ import pytest
 
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.feed import HoldFeed, Seconds
-from membrane_ctrl.web.history import Series, history, thinned
+from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, thinned
 
 NOW_S = 1_800_000_000.0
 

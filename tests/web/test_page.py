@@ -89,7 +89,7 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
 
 
 def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
-    options = server.WebOptions(tmp_path, None, None, "0.0.0.0", 7480, (), None, None, None)  # noqa: S104
+    options = server.WebOptions(tmp_path, None, None, "0.0.0.0", 7480, (), None, None, None)
     with pytest.raises(InputError, match="other machines need TLS and a login"):
         server.accounts_of(options)
     assert server.accounts_of(replace(options, host="127.0.0.1")).users == {}
