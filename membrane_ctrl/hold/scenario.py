@@ -16,7 +16,6 @@ from pydantic import Field, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.console import process, why
 from membrane_ctrl.controller import tick
 from membrane_ctrl.controller.commands import Command, Kind
@@ -187,7 +186,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
     played = scenario.load_scenario(path, scenario.Scenario)
     name = name or path.stem
     # a stranger's file decides neither where runs are stored nor which are deleted
-    config = played.config.model_copy(update={"recording": RecordingConfig()})
+    config = played.config.model_copy(update={"recording": schema.RecordingConfig()})
     with contextlib.ExitStack() as stack:
         addresses = {n: stack.enter_context(ring.ring(*size)) for n, size in _sizes(config).items()}
         writers = {n: stack.enter_context(contextlib.closing(ring.RingWriter(a))) for n, a in addresses.items()}
@@ -208,7 +207,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
     return errors.Exit.INTERRUPTED if run.stopped else errors.Exit.DONE
 
 
-def _sizes(config: Config) -> dict[str, tuple[int, int]]:
+def _sizes(config: schema.Config) -> dict[str, tuple[int, int]]:
     """Slots of the rings for two rounds, and bytes of each."""
     ticks = round(2 * _ROUND_S * config.loop.rate_hz)
     return {

@@ -1,4 +1,4 @@
-"""Who may see the page, and who may act: a one-time link on this machine, names and passwords elsewhere.
+"""Who may see the page, and what a viewer may ask of a hold.
 
 The address bar is not enough: any program on this machine, and any page in a browser on it, can reach a port of
 localhost. So every request needs a session cookie, which a link with a secret or a password gives; requests with a
@@ -10,17 +10,18 @@ import asyncio
 import hashlib
 import hmac
 import html
+import math
 import secrets
 import time
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 from urllib.parse import parse_qs, urlsplit
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model import errors
 
 COOKIE = "membrane_ctrl"
@@ -248,3 +249,81 @@ async def _answer(
     start: Literal["http.response.start"] = "http.response.start"
     await send({"type": start, "status": int(status), "headers": [*(headers or []), *_HEADERS]})
     await send({"type": "http.response.body", "body": text.encode()})
+
+
+# What a viewer may ask: the commands of `ctl` that take one number or one text at most.
+
+_RANK: dict[str, int] = {"read": 0, "operate": 1, "tune": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """A button.
+
+    `asks` is what the viewer types: a number in the given unit, a text, or nothing but yes.
+    """
+
+    do: Kind | Literal["quiet"]
+    label: str
+    icon: str  # a Material icon's name
+    asks: Literal["", "number", "text"] = ""
+    unit: str = ""
+
+    @property
+    def role(self) -> Role:
+        """The role that it needs."""
+        return "operate" if self.do == "quiet" else TABLE[self.do].role
+
+    @property
+    def does(self) -> str:
+        """What it does, in a sentence."""
+        return "Acknowledge the alarms: no reminders." if self.do == "quiet" else TABLE[self.do].does
+
+    @property
+    def states(self) -> frozenset[str]:
+        """States in which the hold obeys, in lower case; all for `quiet`."""
+        return frozenset(state.name.lower() for state in (ANY if self.do == "quiet" else TABLE[self.do].states))
+
+
+STOP = Action("stop", "STOP", "stop_circle")
+ACTIONS = (
+    Action("hold", "Hold", "play_arrow"),
+    Action("pause", "Pause", "pause"),
+    Action("resume", "Resume", "play_circle"),
+    Action("setpoint", "Setpoint", "straighten", "number", "um"),
+    Action("manual", "Manual flow", "tune", "number", "um/s"),
+    Action("shape_on", "Shape loop on", "toggle_on"),
+    Action("shape_off", "Shape loop off", "toggle_off"),
+    Action("mark", "Mark", "bookmark", "text"),
+    Action("capture", "Capture set", "photo_camera"),
+    Action("keep", "Keep gains", "done_all"),
+    Action("ack", "Clear fault", "check_circle"),
+    Action("quiet", "Quiet alarms", "notifications_off"),
+    Action("lower", "Lower", "south"),
+    Action("vent", "Vent", "air"),
+    Action("latch", "Lock", "lock", "text"),
+)
+
+
+def may(user: WebUser, port_role: str, action: Action) -> bool:
+    """Whether the viewer's role and that of this process at the port both allow it."""
+    return min(_RANK[user.role], _RANK.get(port_role, 0)) >= _RANK[action.role]
+
+
+def request(action: Action, user: WebUser, given: str, take_over: bool = False) -> dict[str, Any]:
+    """The request to send. Raises ValueError with what is wrong with the input."""
+    asked: dict[str, Any] = {"do": action.do, "why": f"web: {user.name}", "take_over": take_over}
+    if action.asks == "number":
+        try:
+            value = float(given.replace(",", "."))
+        except ValueError:
+            raise ValueError(f"{action.label}: enter a number in {action.unit}") from None
+        if not math.isfinite(value):
+            raise ValueError(f"{action.label}: enter a finite number in {action.unit}")
+        asked["value"] = value
+    elif action.asks == "text":
+        if not given.strip() and action.do == "mark":
+            raise ValueError("Mark: enter a text")
+        if given.strip():
+            asked["text"] = given.strip()
+    return asked

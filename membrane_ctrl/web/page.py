@@ -9,8 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.access import WebUser
-from membrane_ctrl.web.actions import ACTIONS, STOP, Action, may, request
+from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
 from membrane_ctrl.web.panels import runs_panel, tuning_panel
 

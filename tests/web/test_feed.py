@@ -13,8 +13,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.web.access import WebUser
-from membrane_ctrl.web.actions import ACTIONS, STOP, may, request
+from membrane_ctrl.web.access import ACTIONS, STOP, WebUser, may, request
 from membrane_ctrl.web.feed import HoldFeed
 from tests.control_port.port_run import ROW, port_run
 
