@@ -9,7 +9,7 @@ _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by t
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
 Camera  # the role that the camera drivers fill
 _.geometry_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
-_.frame_rms_adu, _.step_periods, _.white_sigma, _.fast_sigma, _.slow_sigma, _.sensitivity_sigma  # parts of a result
+_.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
 _.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring about
 _.__signature__  # Typer reads a command's options from it

@@ -34,7 +34,7 @@ from tuning.proposal import design
 from tuning.rig import Rig
 
 PLANT = loop_model.PlantModel(0.9, 0.4, 0.3, 1.2)
-CALM = disturbance.Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02)
+CALM = disturbance.Noise(1.0, 0.01, 0.01, 12.0, 0.02)
 LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 MADE = Workpiece("made up", PLANT, disturbance.DisturbanceModel(CALM, None, None), LOOP, None, None)
 GAINS = (

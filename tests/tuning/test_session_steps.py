@@ -27,7 +27,7 @@ from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std
 from tuning.rig import Rig
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
-WEATHER = DisturbanceModel(Noise(1.0, 0.01, 0.01, 12.0, 0.05, 0.1, 0.1, 0.02), None, None)
+WEATHER = DisturbanceModel(Noise(1.0, 0.01, 0.01, 12.0, 0.02), None, None)
 LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 
 
@@ -224,7 +224,7 @@ def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
 @pytest.mark.parametrize("gain", [0.6, pytest.param(1.0, marks=pytest.mark.campaign)])
 def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: float) -> None:
     """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost 40 %."""
-    rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.05, 0.1, 0.1, 0.02)
+    rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.02)
     barometer = WeatherGain(-0.36, 0.01, 2 * 1.2**2 / 30, 0.05, 0.0)
     weather = DisturbanceModel(rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0))
     loop = LoopConfig(kp_per_s=0.25, ti_s=20.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -17,20 +19,56 @@ def walk(rng: np.random.Generator, per_s: float) -> np.ndarray:
     return np.cumsum(rng.standard_normal(N)) * np.sqrt(per_s * DT_S)
 
 
-def test_noise_and_both_walks_are_told_apart() -> None:
+W = np.geomspace(0.15, 3.0, 8)  # where it matters to a loop
+
+
+def test_both_walks_are_told_from_noise() -> None:
     rng = np.random.default_rng(2)
     series = walk(rng, 0.05) + lagged(walk(rng, 1.0), 12.0, DT_S) + 0.5 * rng.standard_normal(N)
     found = fit_noise(series, DT_S, 12.0)
     assert found.white == pytest.approx(0.5, rel=0.02)
-    assert abs(found.fast / 0.05 - 1) < 3 * found.fast_sigma < 1
-    assert abs(found.slow / 1.0 - 1) < 3 * found.slow_sigma
+    assert found.moving_psd(W) == pytest.approx((0.05 + 1 / (1 + (W * 12) ** 2)) / W**2, rel=0.35)
+
+
+def coloured(rng: np.random.Generator, psd: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """A series of a given two-sided spectrum; the FFT of white noise shares no code with the fit."""
+    w = 2 * np.pi * np.fft.rfftfreq(N, DT_S)
+    w[0] = w[1]
+    return np.fft.irfft(np.fft.rfft(rng.standard_normal(N)) * np.sqrt(psd(w) / DT_S), N)
+
+
+COLOURS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "1/f, no higher than 1 Hz": lambda w: 0.05 / w / (1 + (w / 6.3) ** 2) ** 2,
+    "1/f^1.5": lambda w: 0.03 / w**1.5,
+    "one hump at 0.1 Hz": lambda w: 0.3 / (1 + (w / 0.6) ** 2) ** 2,
+}
+
+
+@pytest.mark.parametrize("psd", COLOURS.values(), ids=COLOURS)
+@pytest.mark.parametrize("laser_um", [0.1, 1.0])
+def test_the_deviation_of_a_loop_is_predicted_in_movement_of_any_colour(
+    psd: Callable[[np.ndarray], np.ndarray], laser_um: float
+) -> None:
+    """A loop without delay, K / (s + K): its deviation is an integral over the true spectrum."""
+    rng = np.random.default_rng(7)
+    found = fit_noise(coloured(rng, psd) + laser_um * rng.standard_normal(N), DT_S, 12.0)
+    w = np.geomspace(0.02, np.pi / DT_S, 2000)
+    for k in (0.2, 0.5, 1.5):
+        predicted, true = (np.trapezoid(s * w**2 / (w**2 + k**2), w) for s in (found.moving_psd(w), psd(w)))
+        assert predicted**0.5 == pytest.approx(true**0.5, rel=0.15)
+
+
+def test_white_noise_alone_moves_little() -> None:
+    found = fit_noise(np.random.default_rng(8).standard_normal(N), DT_S, 12.0)
+    w = np.geomspace(0.1, np.pi / DT_S, 500)
+    assert np.trapezoid(found.moving_psd(w), w) / np.pi < 0.05**2
 
 
 def test_a_trend_is_no_disturbance() -> None:
     rng = np.random.default_rng(3)
     series = walk(rng, 0.01) + rng.standard_normal(N)
     plain, tilted = (fit_noise(s, DT_S, 12.0) for s in (series, series + 0.5 * DT_S * np.arange(N)))
-    assert tilted.fast == pytest.approx(plain.fast, rel=0.05, abs=1e-4)
+    assert tilted.moving_psd(W) == pytest.approx(plain.moving_psd(W), rel=0.05, abs=1e-4)
     assert tilted.white == pytest.approx(plain.white, rel=1e-3)
 
 

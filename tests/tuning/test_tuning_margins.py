@@ -99,7 +99,7 @@ def test_a_load_step_against_simulation(ti_s: float) -> None:
 
 def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() -> None:
     loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
-    calm = DisturbanceModel(Noise(1e-3, 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 0.02), None, None)
+    calm = DisturbanceModel(Noise(1e-3, 0.0, 0.0, 12.0, 0.02), None, None)
     held = preview(loop, PumpConfig(), PUMP, calm, duration_s=1.0)
     found = load_step(Gains.of(loop), PUMP, 0.6, 0.02)
     assert found.peak_um == pytest.approx(held.load_peak_um, rel=0.02)
@@ -129,7 +129,7 @@ def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
 
 def typical(loop: LoopConfig) -> DisturbanceModel:
     """The twin's typical weather, known exactly; its slow return is left out."""
-    noise = Noise(math.sqrt(1.0 + 0.1**2 / 12), 0.0, 0.0, 12.0, 0.0, 0.0, 0.0, 1 / loop.rate_hz)
+    noise = Noise(math.sqrt(1.0 + 0.1**2 / 12), 0.0, 0.0, 12.0, 1 / loop.rate_hz)
     barometer = WeatherGain(-0.358, 0.0, 2 * 1.2**2 / 30, 0.05, 0.0)
     return DisturbanceModel(noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0))
 

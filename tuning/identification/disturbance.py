@@ -3,16 +3,19 @@
 The response to the flow is removed from the readings, z = y - k int v(t - theta) dt, whatever loop made the flow. The
 rest is the weather and the laser's noise. Its increments have the spectrum (per sample, dt S)
 
-    |1 - e^(-j w dt)|^2 r  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
+    |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
 
 r: laser noise (um^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
-through the film, tau = 12 s (air temperature). Without the last term this is the IMA(1,1) process. The
-intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments.
+through the film, tau = 12 s (air temperature), s_i: movement of any other colour, for weather is no random walk at
+all frequencies and the standard deviation of a loop depends on those about its bandwidth. The tau_i stand in
+equal ratios; log s_i bends little from one to the next, so that the spectrum goes on as it was where noise hides it. The
+intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments, times
+that prior.
 Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and 9.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -28,29 +31,43 @@ SLOWEST_S = 100.0
 _FLOOR = 1e-12  # um^2: stands for a zero intensity
 _LARGEST = 1e9  # um^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
+_COLOUR_RATIO = 2.0  # of neighbouring tau_i, from the sample time to the slowest
+# of first and second differences of log s_i: a spectrum falls with the square of the frequency, more or less, and does
+# not bend all at once
+_SLOPE_SIGMA, _BEND_SIGMA = 2.0, 1.0
+_BAND = 0.03  # frequencies nearer than this factor count as one
+_BLOCKS = 10  # of a record, whose variances show how steady the weather is
+
+Coloured = tuple[tuple[float, float], ...]  # (tau in s, s in unit^2 s) of s / (1 + (w tau)^2)^2
+
+
+def _coloured_psd(coloured: Coloured, w_rad_per_s: records.Series) -> records.Series:
+    parts = [intensity / (1 + (w_rad_per_s * tau_s) ** 2) ** 2 for tau_s, intensity in coloured]
+    return np.sum(parts, axis=0) if parts else np.zeros_like(w_rad_per_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise of a reading and the random walk of its quantity."""
+    """White noise of a reading, the random walk of its quantity, and its movement of other colours."""
 
     white: float  # standard deviation of a sample
     fast: float  # intensities of the walks: variance per second
     slow: float
     slow_s: float  # lag of the slow walk
-    white_sigma: float  # relative standard error of each variance
-    fast_sigma: float
-    slow_sigma: float
     dt_s: float  # sample time that `white` belongs to
+    coloured: Coloured = ()
 
     def __post_init__(self) -> None:
         """Raises ValueError for impossible fits, as a file may hold anything."""
         if not all(0 <= part <= _LARGEST for part in (self.white, self.fast, self.slow, self.slow_s, self.dt_s)):
             raise ValueError(f"noise of {self.white:g} and walks of {self.fast:g} and {self.slow:g}")
+        if not all(0 < tau_s <= _LARGEST and 0 <= part <= _LARGEST for tau_s, part in self.coloured):
+            raise ValueError(f"movement of {self.coloured}")
 
     def moving_psd(self, w_rad_per_s: records.Series) -> records.Series:
         """Two-sided spectrum of the true movement, unit^2 s."""
-        return (self.fast + self.slow / (1 + (w_rad_per_s * self.slow_s) ** 2)) / w_rad_per_s**2
+        walks = (self.fast + self.slow / (1 + (w_rad_per_s * self.slow_s) ** 2)) / w_rad_per_s**2
+        return walks + _coloured_psd(self.coloured, w_rad_per_s)
 
     @property
     def white_psd(self) -> float:
@@ -65,45 +82,77 @@ def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records
 
 
 def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
-    """Fit the intensities of white noise and walks in a series; a straight trend has no effect.
+    """Fit the intensities of white noise and movement in a series; a straight trend has no effect.
 
     Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the lag of the slow
     walk; 0 omits it.
     """
     if series.size * dt_s < 2 * SLOWEST_S:
         raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * SLOWEST_S:.0f} s at least")
-    w, power = _periodogram(np.diff(series), dt_s)
-    shapes = [np.abs(1 - np.exp(-1j * w * dt_s)) ** 2, np.full(w.size, dt_s)]
-    if slow_s > 0:
-        shapes.append(dt_s / (1 + (w * slow_s) ** 2))
-    basis = np.array(shapes)
+    w, power, count = _periodogram(np.diff(series), dt_s)
+    white = np.abs(1 - np.exp(-1j * w * dt_s)) ** 2
+    walks = [np.full(w.size, dt_s), *([dt_s / (1 + (w * slow_s) ** 2)] if slow_s > 0 else [])]
+    slowest_s = SLOWEST_S / (2 * math.pi)
+    taus_s = np.geomspace(dt_s, slowest_s, 1 + round(math.log(slowest_s / dt_s, _COLOUR_RATIO)))
+    first = 1 + len(walks)
+    basis = np.array([white, *walks, *(white / dt_s / (1 + (w * tau_s) ** 2) ** 2 for tau_s in taus_s)])
+    likely, usual = _prior(taus_s, first)
+    walk = float(np.mean(power[:8])) / dt_s
+    guess = [float(power @ count / count.sum()) / 2, *[walk] * len(walks), *(walk * taus_s**2 / taus_s.size)]
+    intensities = np.exp(_likeliest(basis, power, count, likely, usual, np.log(guess)))
+    fast, slow = (*intensities[1:first].tolist(), 0.0)[:2]
+    coloured = tuple(zip(taus_s.tolist(), intensities[first:].tolist(), strict=True))
+    return Noise(math.sqrt(intensities[0]), fast, slow, slow_s, dt_s, coloured)
+
+
+def _prior(taus_s: records.Series, first: int) -> tuple[records.Series, records.Series]:
+    """Rows R and values r: R x logs - r are independent and of unit variance; `first` logs are free."""
+    one = np.eye(taus_s.size)
+    rows = np.vstack((np.diff(one, 2, axis=0) / _BEND_SIGMA, np.diff(one, axis=0) / _SLOPE_SIGMA))
+    return np.hstack((np.zeros((len(rows), first)), rows)), rows @ (2 * np.log(taus_s))
+
+
+def _likeliest(
+    basis: records.Series,
+    power: records.Series,
+    count: records.Series,
+    likely: records.Series,
+    usual: records.Series,
+    start: records.Series,
+) -> records.Series:
+    """Logarithms of the intensities; Whittle's likelihood with its information matrix."""
 
     def cost(logs: records.Series) -> tuple[float, records.Series]:
-        parts = (np.exp(logs) + _FLOOR)[:, None] * basis
-        spectrum = parts.sum(axis=0)
-        slope = parts / spectrum * (1 - power / spectrum)
-        return float(np.sum(np.log(spectrum) + power / spectrum)), slope.sum(axis=1)
+        spectrum = np.exp(logs) @ basis
+        off = likely @ logs - usual
+        slope = _shares(logs, basis) @ (count * (1 - power / spectrum)) + likely.T @ off
+        return float(count @ (np.log(spectrum) + power / spectrum) + off @ off / 2), slope
 
-    fast_guess = float(np.mean(power[: max(8, w.size // 1000)])) / dt_s
-    start = np.log(np.array([float(np.mean(power)) / 2, fast_guess, fast_guess][: len(basis)]))
-    fit = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(math.log(_FLOOR), 20.0)] * len(basis))
-    intensities = np.exp(fit.x)
-    shares = intensities[:, None] * basis / (intensities @ basis)
-    errors = np.sqrt(np.diag(np.linalg.pinv(shares @ shares.T)) * _HANN_LOSS)
-    white, fast, slow = (*intensities, 0.0, 0.0)[:3]
-    white_error, fast_error, slow_error = (*errors, 0.0, 0.0)[:3]
-    sigmas = (float(white_error), float(fast_error), float(slow_error))
-    return Noise(math.sqrt(white), float(fast), float(slow), slow_s, *sigmas, dt_s)
+    def information(logs: records.Series) -> records.Series:
+        shares = _shares(logs, basis)
+        return np.asarray(shares * count @ shares.T + likely.T @ likely)
+
+    options = {"gtol": 1e-2, "maxiter": 200}
+    found = minimize(cost, start, jac=True, hess=information, method="trust-exact", options=options).x
+    return np.maximum(found, math.log(_FLOOR))
 
 
-def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series]:
-    """Angular frequencies from the slowest that matters to Nyquist, and tapered power per sample."""
+def _shares(logs: records.Series, basis: records.Series) -> records.Series:
+    parts = np.exp(logs)[:, None] * basis
+    return np.asarray(parts / parts.sum(axis=0))
+
+
+def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series, records.Series]:
+    """Angular frequencies from the slowest that matters to Nyquist, tapered power per sample, independent ones."""
     taper = hann(increments.size, sym=False)
     taper /= math.sqrt(float(taper @ taper))
     power = np.abs(np.fft.rfft((increments - increments.mean()) * taper)) ** 2
     w = 2 * np.pi * np.fft.rfftfreq(increments.size, dt_s)
     used = slice(int(np.searchsorted(w, 2 * np.pi / SLOWEST_S)), w.size - 1)
-    return np.asarray(w[used], dtype=float), np.asarray(power[used], dtype=float)
+    w, power = w[used], power[used]
+    band = np.unique(np.floor(np.log(w / w[0]) / _BAND), return_inverse=True)[1]
+    count = np.bincount(band)
+    return np.bincount(band, w) / count, np.bincount(band, power) / count, count / _HANN_LOSS
 
 
 # Gains of the weather on the centre: regression of the undriven readings on barometer and lagged air temperature.
@@ -127,6 +176,11 @@ class WeatherGain:
     walk: float  # variance per second of the quantity's random walk, Pa^2/s or K^2/s
     noise: float  # standard deviation of a reading
     lag_s: float  # lag of the quantity's effect on the centre
+    coloured: Coloured = ()  # the quantity's movement that is no walk
+
+    def psd(self, w_rad_per_s: records.Series) -> records.Series:
+        """Two-sided spectrum of the quantity, unit^2 s."""
+        return self.walk / w_rad_per_s**2 + _coloured_psd(self.coloured, w_rad_per_s)
 
     def agreed(self, configured: float) -> float:
         """Gain to use: the fitted one if known to 10 %, else the configured one if they agree.
@@ -175,7 +229,7 @@ def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follow
     variances = np.array([n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)])
     gains, sigmas = _regress(z, columns, variances, per_block)
     found = [
-        WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s)
+        WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s, noise.coloured)
         for g, s, noise, (_, lag_s) in zip(gains, sigmas, noises, channels, strict=True)
     ]
     rest = z - sum(g * (column - column[0]) for g, column in zip(gains, columns, strict=True))
@@ -222,6 +276,9 @@ class DisturbanceModel:
     rest: Noise  # the laser's noise and the walks that no weather sensor explains
     barometer: WeatherGain | None  # the part explained by the sensors
     air: WeatherGain | None
+    # Relative, 1 sigma: how far the standard deviation of ten other minutes may be from the one predicted, by weather
+    # that comes and goes (gusts)
+    unsteady: float = 0.0
 
     @property
     def laser_um(self) -> float:
@@ -246,7 +303,7 @@ class DisturbanceModel:
                 continue
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
             reaction = gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
-            total = total + weather.walk / w_rad_per_s**2 * np.abs(weather.gain * lag - reaction) ** 2
+            total = total + weather.psd(w_rad_per_s) * np.abs(weather.gain * lag - reaction) ** 2
             total = total + weather.noise**2 * dt_s * np.abs(reaction) ** 2
         return np.asarray(total, dtype=float)
 
@@ -255,4 +312,22 @@ def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConf
     """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
     weather = fit_weather(record, model, loop.gas_follows_air_s)
     rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
-    return DisturbanceModel(rest, weather.barometer, weather.air)
+    found = DisturbanceModel(rest, weather.barometer, weather.air)
+    return replace(found, unsteady=_unsteady(record.filled_displacement_um(), found, model, loop))
+
+
+def _unsteady(
+    read_um: records.Series, found: DisturbanceModel, model: loop_model.PlantModel, loop: LoopConfig
+) -> float:
+    """Relative standard error of the centre's standard deviation, for this record and one more like it.
+
+    From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves the movement.
+    """
+    w: records.Series = 2 * np.pi * np.fft.rfftfreq(read_um.size, found.rest.dt_s)
+    w[0] = w[1]
+    moving = found.psd(w, model, loop)
+    centre_um = np.fft.irfft(
+        np.fft.rfft(read_um - read_um.mean()) * moving / (moving + found.rest.white_psd), read_um.size
+    )
+    variances = np.mean(centre_um[: read_um.size // _BLOCKS * _BLOCKS].reshape(_BLOCKS, -1) ** 2, axis=1)
+    return float(variances.std(ddof=1) / max(variances.mean(), _FLOOR) / 2 * math.sqrt(2 / _BLOCKS))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments.machine import BenchSample
 from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel
@@ -39,6 +40,7 @@ class ModelBench:
         leak_step: tuple[float, float] = (math.inf, 0.0),
     ) -> None:
         self._model, self._disturbance, self._pump = model, disturbance, pump
+        self._curve = gas.branch(pump, pump.curve_um_per_s)
         self._leak_step = leak_step
         self._rng = np.random.default_rng(seed)
         self._dt_s = disturbance.rest.dt_s
@@ -48,8 +50,11 @@ class ModelBench:
         self._arriving = flow
         self._running = True
         self._way_um = 0.0
-        # walks: fast, slow rest, what the slow one reaches, barometer, air, gas
-        self._walks = np.zeros(6)
+        self._walks = prediction.Walks.of(disturbance)
+        self._transition, kicks = self._walks.over(self._dt_s)
+        sizes, ways = np.linalg.eigh(kicks)
+        self._kicks = ways * np.sqrt(np.maximum(sizes, 0.0))
+        self._weather = np.zeros(len(kicks))
         self._ticks = 0
         self.true_um: list[float] = []
 
@@ -57,8 +62,7 @@ class ModelBench:
         """Run one tick. The vent is assumed as during the identification of the leak."""
         pump = self._pump
         self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
-        share = (pump_fraction - pump.dead_fraction) / (1 - pump.dead_fraction)
-        flow = pump.flow_full_um_per_s * max(0.0, share) if self._running else 0.0
+        flow = self._curve.flow(pump_fraction) if self._running else 0.0
         at_s, size = self._leak_step
         leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
         follow = -math.expm1(-self._step_s / self._model.lag_s)
@@ -66,31 +70,21 @@ class ModelBench:
             self._tube.append(flow)
             self._arriving += (self._tube.popleft() - self._arriving) * follow
             self._way_um += (self._model.gain * self._arriving - leak) * self._step_s
-        return self._read(self._weather_um())
+        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(self._weather.size)
+        return self._read()
 
-    def _weather_um(self) -> float:
-        """Advance the weather by a tick; return its effect on the centre."""
+    def _read(self) -> BenchSample:
         of, walks = self._disturbance, self._walks
-        barometer, air = of.barometer, of.air
-        kicks = (of.rest.fast, of.rest.slow, 0.0, barometer.walk if barometer else 0.0, air.walk if air else 0.0, 0.0)
-        walks += np.sqrt(np.array(kicks) * self._dt_s) * self._rng.standard_normal(6)
-        for source, target, lag_s in ((1, 2, of.rest.slow_s), (4, 5, air.lag_s if air else 1.0)):
-            walks[target] -= math.expm1(-self._dt_s / lag_s) * (walks[source] - walks[target])
-        moved = walks[0] + walks[2]
-        moved += barometer.gain * walks[3] if barometer else 0.0
-        moved += air.gain * walks[5] if air else 0.0
-        return float(moved)
-
-    def _read(self, weather_um: float) -> BenchSample:
-        of = self._disturbance
-        true_um = self._way_um + weather_um
+        true_um = self._way_um + float(walks.centre @ self._weather)
         self.true_um.append(true_um)
         self._ticks += 1
         laser, pressure, temperature = self._rng.standard_normal(3).tolist()
         return BenchSample(
             true_um + of.laser_um * laser,
-            _LEVEL_PA + self._walks[3] + of.barometer.noise * pressure if of.barometer else math.nan,
-            _LEVEL_C + self._walks[4] + of.air.noise * temperature if of.air else math.nan,
+            _LEVEL_PA + float(walks.barometer @ self._weather) + of.barometer.noise * pressure
+            if of.barometer
+            else math.nan,
+            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature if of.air else math.nan,
         )
 
 
@@ -116,7 +110,7 @@ def preview(
 ) -> Preview:
     """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
     true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
-    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0)
+    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=())
     calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
     answer_um = _held(loop, pump, model, stepped, 120.0)

@@ -52,20 +52,21 @@ def least_std_um(
 
     `write_s` is the time from a reading to its command, if the model's dead time does not include it.
     """
-    drift, diffusion, centre = _walks(disturbance)
+    moving = Walks.of(disturbance)
+    centre = moving.centre
     readings, noises = [centre], [disturbance.rest.white**2]
-    for index, weather, used in (
-        (0, disturbance.barometer, loop.feedforward_barometer),
-        (1, disturbance.air, loop.feedforward_temperature),
+    for reading, weather, used in (
+        (moving.barometer, disturbance.barometer, loop.feedforward_barometer),
+        (moving.air, disturbance.air, loop.feedforward_temperature),
     ):
         if weather is not None and used:
-            readings.append(np.eye(len(drift))[index])
+            readings.append(reading)
             noises.append(weather.noise**2)
     c, r = np.array(readings), np.diag(noises)
-    transition, kicks = _discrete(drift, diffusion, disturbance.rest.dt_s)
+    transition, kicks = moving.over(disturbance.rest.dt_s)
     before = solve_discrete_are(transition.T, c.T, kicks, r)
     after = before - before @ c.T @ np.linalg.solve(c @ before @ c.T + r, c @ before)
-    transition, kicks = _discrete(drift, diffusion, model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
+    transition, kicks = moving.over(model.dead_time_s + write_s + disturbance.rest.dt_s / 2)
     return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))
 
 
@@ -75,25 +76,48 @@ _RETURN_S = 3600.0
 _UNSEEN = 1e-6
 
 
-def _walks(disturbance: DisturbanceModel) -> tuple[Matrix, Matrix, Matrix]:
-    """States: barometer, air, gas, fast rest, slow rest, what it reaches; their drift, diffusion, and the centre."""
-    barometer, air, rest = disturbance.barometer, disturbance.air, disturbance.rest
-    drift = -np.eye(6) / _RETURN_S
-    air_s = air.lag_s if air is not None else rest.slow_s
-    drift[2, 1:3] = 1 / air_s, -1 / air_s
-    drift[5, 4:6] = 1 / rest.slow_s, -1 / rest.slow_s
-    walks = (barometer.walk if barometer else _UNSEEN, air.walk if air else _UNSEEN)
-    diffusion = np.diag([walks[0], walks[1], 0.0, max(rest.fast, _UNSEEN), max(rest.slow, _UNSEEN), 0.0])
-    centre = np.array([barometer.gain if barometer else 0.0, 0.0, air.gain if air else 0.0, 1.0, 0.0, 1.0])
-    return drift, diffusion, centre
+@dataclass(frozen=True, slots=True)
+class Walks:
+    """The disturbance as states: their drift (n, n) and diffusion (n, n), and three sums of them (n,)."""
 
+    drift: Matrix
+    diffusion: Matrix
+    barometer: FloatArray
+    air: FloatArray
+    centre: FloatArray
 
-def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, Matrix]:
-    """Transition and noise covariance over a step (Van Loan 1978)."""
-    n = len(drift)
-    block = expm(np.block([[-drift, diffusion], [np.zeros((n, n)), drift.T]]) * step_s)
-    transition = block[n:, n:].T
-    return transition, transition @ block[:n, n:]
+    @classmethod
+    def of(cls, disturbance: DisturbanceModel) -> "Walks":
+        """States: barometer, air, gas, fast rest, slow rest, what it reaches; two more for each colour."""
+        barometer, air, rest = disturbance.barometer, disturbance.air, disturbance.rest
+        colours = [
+            (source, *colour) for source, of in enumerate((barometer, air, rest)) if of for colour in of.coloured
+        ]
+        n = 6 + 2 * len(colours)
+        drift, diffusion = -np.eye(n) / _RETURN_S, np.zeros((n, n))
+        air_s = air.lag_s if air is not None else rest.slow_s
+        walks = (barometer.walk if barometer else _UNSEEN, air.walk if air else _UNSEEN)
+        np.fill_diagonal(diffusion[:6, :6], [*walks, 0.0, max(rest.fast, _UNSEEN), max(rest.slow, _UNSEEN), 0.0])
+        sums = np.zeros((3, n))
+        sums[0, 0] = sums[1, 1] = sums[2, 3] = sums[2, 5] = 1.0
+        for first, (source, tau_s, intensity) in zip(range(6, n, 2), colours, strict=True):
+            drift[first, first] = drift[first + 1, first + 1] = -1 / tau_s
+            drift[first + 1, first] = 1 / tau_s
+            diffusion[first, first] = intensity / tau_s**2
+            sums[source, first + 1] = 1.0
+        drift[2] += sums[1] / air_s
+        drift[2, 2] = -1 / air_s
+        drift[5, 4:6] = 1 / rest.slow_s, -1 / rest.slow_s
+        centre = sums[2] + (barometer.gain if barometer else 0.0) * sums[0]
+        centre[2] = air.gain if air else 0.0
+        return cls(drift, diffusion, sums[0], sums[1], centre)
+
+    def over(self, step_s: float) -> tuple[Matrix, Matrix]:
+        """Transition and noise covariance over a step (Van Loan 1978)."""
+        n = len(self.drift)
+        block = expm(np.block([[-self.drift, self.diffusion], [np.zeros((n, n)), self.drift.T]]) * step_s)
+        transition = block[n:, n:].T
+        return transition, transition @ block[:n, n:]
 
 
 def loop_figures(
