@@ -30,6 +30,7 @@ from membrane_ctrl.sessions.folder import newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import second_world
 from tuning import command, gains_file, opening, session
+from tuning.opening import TuneOptions, TwinHold
 
 DEFAULT_FILE = Path("build/benches.jsonl")
 SETTLE_S, HOLD_S = 120.0, 600.0
@@ -137,9 +138,9 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     found |= _held("default", bench, config)
     if "default_error" in found:
         return found
-    hold: list[opening.TwinHold] = []
+    hold: list[TwinHold] = []
 
-    def opened(given: Config) -> opening.TwinHold:
+    def opened(given: Config) -> TwinHold:
         hold.append(twin_hold_of(bench, given, 1))
         return hold[-1]
 
@@ -165,8 +166,8 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     return found
 
 
-def _options(config: Config, logs: Path) -> opening.TuneOptions:
-    return opening.TuneOptions(
+def _options(config: Config, logs: Path) -> TuneOptions:
+    return TuneOptions(
         config=config, twin=True, where=Where(), logs=logs, session=None, name="bench", author="benchmark",
         reason="drawn bench", limit_um=LIMIT_UM, observe_s=session.OBSERVE_S, verify_s=600.0, take_over=False,
         yes=True, choose="", json=False,
@@ -184,9 +185,9 @@ def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     return found | _held("tuned", bench, tuned)
 
 
-def twin_hold_of(bench: DrawnBench, config: Config, weather_seed: int) -> opening.TwinHold:
+def twin_hold_of(bench: DrawnBench, config: Config, weather_seed: int) -> TwinHold:
     """A hold of the bench in virtual time."""
-    return opening.TwinHold(config, bench=second_world.foreign_bench(bench.plant(weather_seed)))
+    return TwinHold(config, bench=second_world.foreign_bench(bench.plant(weather_seed)))
 
 
 def _held(name: str, bench: DrawnBench, config: Config) -> dict[str, Any]:

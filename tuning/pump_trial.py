@@ -15,9 +15,11 @@ from tuning.identification import characterise, identify, loop_model, pump_curve
 from tuning.rig import HoldRig
 
 _MAP_S = 3600.0
-# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer.
-_CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0}
+# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer;
+# behind a slow ramp an actuator several times as strong as configured does not carry the mirror past the setpoint.
+_CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
+_BEFORE_S = 20.0  # whose mean flow about holds the mirror
 _DARK_MOST = 3  # experiments in a row that a lost laser ended
 _CHECK_BEFORE_S, _CHECK_S, _CHECK_AFTER_S = 40.0, 120.0, 15.0
 _CURVE_OFF = 0.2  # of k; the margins tolerate more
@@ -72,10 +74,12 @@ def map_pump(
 
 
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
-    around = rig.around(_returned(rig), limit_um)
-    holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
-    survey = pump_survey.PumpSurvey(holding, around.limit_um)
+    _returned(rig)
+    around = rig.around(rig.hold(_BEFORE_S), limit_um)
+    curve = gas.PumpCurve(rig.pump)
+    survey = pump_survey.PumpSurvey(curve.fraction(around.holding_flow_um_per_s), around.limit_um)
     while steps := survey.steps():
+        around = replace(around, holding_flow_um_per_s=curve.flow(survey.holding))
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         survey.take(run_of(rows, rig.dt_s), finished.completed)

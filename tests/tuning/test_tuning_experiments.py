@@ -19,6 +19,7 @@ from membrane_ctrl.control.experiments.machine import (
     Relay,
     doublets,
     multisine,
+    quiet_stretch,
     steps,
 )
 from membrane_ctrl.sim.bench_events import AmbientChange, LaserDropout
@@ -204,6 +205,17 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
     rig.run(Patterned(around, lambda time_s: 0.0, 5.0, 0.0), around, 0.0)
     after = rig.hold(5.0)
     assert np.abs(after.flow_um_per_s - around.holding_flow_um_per_s).max() < 0.05
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0, 100.0])
+@pytest.mark.parametrize("laser_um", [0.3, 1.0, 2.0])
+def test_noise_alone_stops_no_experiment_at_any_rate(rate_hz: float, laser_um: float) -> None:
+    """A sound relay turns the centre at 5 um in a limit of 10; two minutes of noise there."""
+    around = replace(AROUND, laser_um=laser_um, stretch=quiet_stretch(laser_um, AROUND.limit_um, rate_hz))
+    guard = ExcursionGuard(Patterned(around, lambda _: 0.0, 1e9, 0.0), around, 0.0, rate_hz)
+    rng = np.random.default_rng(1)
+    for noise_um in (laser_um * rng.standard_normal(round(120 * rate_hz))).tolist():
+        assert not isinstance(guard.step(BenchSample(5.0 + noise_um), 1 / rate_hz), Finished)
 
 
 def test_the_noise_kept_in_hand_is_that_of_the_tick_rate() -> None:

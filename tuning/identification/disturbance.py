@@ -8,9 +8,9 @@ rest is the weather and the laser's noise. Its increments have the spectrum (per
 r: laser noise (um^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
 through the film, tau = 12 s (air temperature), s_i: movement of any other colour, for weather is no random walk at
 all frequencies and the standard deviation of a loop depends on those about its bandwidth. The tau_i stand in
-equal ratios; log s_i bends little from one to the next, so that the spectrum goes on as it was where noise hides it. The
-intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments, times
-that prior.
+equal ratios; log s_i bends little from one to the next, so that the spectrum goes on as it was where noise hides it.
+The intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments,
+times that prior.
 Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and 9.
 """
 
@@ -32,8 +32,8 @@ _FLOOR = 1e-12  # um^2: stands for a zero intensity
 _LARGEST = 1e9  # um^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
 _COLOUR_RATIO = 2.0  # of neighbouring tau_i, from the sample time to the slowest
-# of first and second differences of log s_i: a spectrum falls with the square of the frequency, more or less, and does
-# not bend all at once
+# of first and second differences of log s_i: a spectrum falls with the square of the frequency, more or less, and
+# does not bend all at once
 _SLOPE_SIGMA, _BEND_SIGMA = 2.0, 1.0
 _BAND = 0.03  # frequencies nearer than this factor count as one
 _BLOCKS = 10  # of a record, whose variances show how steady the weather is

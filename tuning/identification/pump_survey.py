@@ -117,6 +117,13 @@ class PumpSurvey:
         """The largest flow seen."""
         return max((at.flow_um_per_s for at in self.fit.levels.values()), default=0.0)
 
+    @property
+    def holding(self) -> float:
+        """The command that balances the leak, as far as it is known by now."""
+        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        leak = self.fit.leak_um_per_s
+        return float(np.interp(leak, flows, fractions)) if 0 < leak < flows[-1] else self.holding_fraction
+
     def known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
         return self.sigma(level) <= _KNOWN_SHARE * self.full_um_per_s

@@ -26,7 +26,7 @@ class BenchSample:
     air_temperature_c: float = float("nan")
 
 
-FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed
+FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed, for a reading with little noise
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
 
@@ -47,6 +47,7 @@ class Around:
     full_flow_um_per_s: float
     laser_um: float  # standard deviation of a reading
     limit_um: float = 10.0  # largest excursion of the centre from where it stood
+    stretch: float = 1.0  # of the filters, for a noisy laser with few readings (`quiet_stretch`)
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
@@ -60,11 +61,17 @@ class Experiment(Protocol):
         """Flow in um/s until the next reading, or the end."""
 
 
+# A moving mirror continues for the pump's delay (0.24 s, up to twice that on a slow bench) after the flow is reduced
+_DELAY_S = 0.4
+
+
 class CentreMotion:
     """Position and speed of the centre from noisy readings: two lags, and their difference over their times'."""
 
-    def __init__(self) -> None:
-        self._fast, self._slow = LowPass(FAST_S), LowPass(SLOW_S)
+    def __init__(self, stretch: float = 1.0) -> None:
+        self._fast_s, self._slow_s = stretch * FAST_S, stretch * SLOW_S
+        self._fast, self._slow = LowPass(self._fast_s), LowPass(self._slow_s)
+        self.coast_s = _DELAY_S + self._fast_s  # from a reading to its effect: the filter is late as well
         self.lost_s = 0.0
 
     def update(self, displacement_um: float, dt_s: float) -> None:
@@ -78,33 +85,52 @@ class CentreMotion:
 
     @property
     def position_um(self) -> float:
-        """Filtered reading, `FAST_S` late."""
+        """Filtered reading, as late as the faster filter."""
         return self._fast.value
 
     @property
     def speed_um_per_s(self) -> float:
         """Filtered speed."""
-        return (self._fast.value - self._slow.value) / (SLOW_S - FAST_S)
+        return (self._fast.value - self._slow.value) / (self._slow_s - self._fast_s)
+
+    def noise_per_laser_um(self, rate_hz: float) -> float:
+        """Standard deviation of position + `coast_s` x speed for readings of 1 um.
+
+        It is sigma sqrt(dt / (2 T)) behind a lag.
+        """
+        gain = self.coast_s / (self._slow_s - self._fast_s)
+        fast = (1 + gain) ** 2 / (2 * self._fast_s * rate_hz)
+        slow = gain**2 / (2 * self._slow_s * rate_hz)
+        both = 2 * gain * (1 + gain) / ((self._fast_s + self._slow_s) * rate_hz)
+        return math.sqrt(fast + slow - both)
 
 
-# A moving mirror continues for the pump's delay (0.24 s, up to twice that on a slow bench) after the flow is
-# reduced, and the filter is 0.1 s late.
-COAST_S = 0.5
+_IN_HAND_SIGMAS = 3.0
+# Of the limit, for the noise: with more, the noise stops sound experiments; longer filters see motion later
+_IN_HAND_SHARE = 0.2
+_STRETCHES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+
+
+def quiet_stretch(laser_um: float, limit_um: float, rate_hz: float) -> float:
+    """Filters of this many times their length leave the noise its share of the limit; the longest if none does."""
+    share_um = _IN_HAND_SHARE * limit_um / _IN_HAND_SIGMAS
+    quiet = (s for s in _STRETCHES if laser_um * CentreMotion(s).noise_per_laser_um(rate_hz) <= share_um)
+    return next(quiet, _STRETCHES[-1])
 
 
 class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit.
 
-    The centre is judged where it will come to rest, position + speed x `COAST_S`, with a margin of three standard
+    The centre is judged where it will come to rest, position + speed x time to react, with a margin of three standard
     deviations of that figure's own noise, which grows with fewer readings per second. Raises ValueError, with a
     remedy, if the margin uses up the limit.
     """
 
     def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
         self._experiment = experiment
-        self._motion = CentreMotion()
+        self._motion = CentreMotion(around.stretch)
         self._centre_um = centre_um
-        in_hand_um = 3 * self._noise_per_laser_um(rate_hz) * around.laser_um
+        in_hand_um = _IN_HAND_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
             raise ValueError(
                 f"limit of {around.limit_um:g} um: the laser's noise alone takes {in_hand_um:.1f} um of it at "
@@ -113,23 +139,13 @@ class ExcursionGuard:
         self._bound_um = around.limit_um - in_hand_um
         self._limit_um = around.limit_um
 
-    @staticmethod
-    def _noise_per_laser_um(rate_hz: float) -> float:
-        """Standard deviation of position + coast x speed for readings of 1 um; sigma sqrt(dt / (2 T)) behind a
-        lag."""
-        gain = COAST_S / (SLOW_S - FAST_S)
-        fast = (1 + gain) ** 2 / (2 * FAST_S * rate_hz)
-        slow = gain**2 / (2 * SLOW_S * rate_hz)
-        both = 2 * gain * (1 + gain) / ((FAST_S + SLOW_S) * rate_hz)
-        return math.sqrt(fast + slow - both)
-
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """The experiment's step, or the end of it."""
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:
             return Finished(False, f"the laser reading was lost for {_LOST_MAX_S:g} s: check the laser, then repeat")
         off_um = self._motion.position_um - self._centre_um
-        coming_um = off_um + COAST_S * self._motion.speed_um_per_s
+        coming_um = off_um + self._motion.coast_s * self._motion.speed_um_per_s
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
                 False,
@@ -156,7 +172,7 @@ class Patterned:
         self._pattern = pattern
         self._duration_s = duration_s
         self._centre_um = centre_um
-        self._motion = CentreMotion()
+        self._motion = CentreMotion(around.stretch)
         self._time_s = 0.0
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
@@ -251,7 +267,7 @@ class Relay:
         self._centre_um = centre_um
         self._duration_s = duration_s
         self._threshold_um = THRESHOLD_SHARE * around.limit_um
-        self._motion = CentreMotion()
+        self._motion = CentreMotion(around.stretch)
         first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
         self._amplitudes_um_per_s = {1: first, -1: first}
         self._speeds_um_per_s = {1: first, -1: first}
@@ -289,7 +305,7 @@ class Relay:
         """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""
         wanted_um = OVERSHOOT_SHARE * self._around.limit_um
         # the guard stops anything that would coast further, however short the true delay
-        fastest_um_per_s = wanted_um / COAST_S
+        fastest_um_per_s = wanted_um / self._motion.coast_s
         if self._time_s > self._at_centre_s:
             self._speeds_um_per_s[self._direction] = self._threshold_um / (self._time_s - self._at_centre_s)
         if self.crossings > 0:

@@ -50,10 +50,10 @@ class PumpSteps:
     The session (`tuning`) decides which commands, for how long and until which height, between two experiments.
     """
 
-    def __init__(self, centre_um: float, steps: Sequence[PumpStep]) -> None:
+    def __init__(self, centre_um: float, steps: Sequence[PumpStep], stretch: float = 1.0) -> None:
         self._centre_um = centre_um
         self._steps = list(steps)
-        self._motion = machine.CentreMotion()
+        self._motion = machine.CentreMotion(stretch)
         self._in_step_s = 0.0
 
     def step(self, measurement: machine.BenchSample, dt_s: float) -> float | machine.Finished:
@@ -91,6 +91,7 @@ class Trial:
             full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
+            stretch=machine.quiet_stretch(spec.laser_um, spec.limit_um, loop.rate_hz),
         )
         experiment = self._machine(around, centre_um)
         self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz)
@@ -103,7 +104,7 @@ class Trial:
         if spec.kind == "pump_map":
             if not spec.steps:
                 raise ValueError("a pump map without steps: use `tune pump`")
-            return PumpSteps(centre_um, spec.steps)
+            return PumpSteps(centre_um, spec.steps, around.stretch)
         return machine.Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
 
     @property
