@@ -178,7 +178,9 @@ def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     folder = newest_session(logs)
     done = session.verified_of(folder)
     gains = gains_file.load_gains(folder.file("gains.toml"))
+    sigma = session.offered(folder)[1].sigma
     found: dict[str, Any] = {"kept": done.kept, "reason": done.reason, "predicted_um": gains.predicted_std_um}
+    found["predicted_sigma_um"] = sigma.std_um if sigma is not None else math.nan
     if not done.kept:
         return found
     tuned = config.model_copy(update={"loop": done.after, "pump": folder.config.pump})

@@ -276,7 +276,10 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             )
         case "observe":
             weather = session.disturbance_of(folder)
-            return f"laser noise {weather.laser_um:.2f} um per reading"
+            return (
+                f"laser noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
+                f"scatters by {weather.unsteady:.0%}"
+            )
         case "design":
             gains = gains_file.load_gains(folder.file("gains.toml"))
             return (

@@ -207,7 +207,9 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um per reading.</p>",
+        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um per reading. Every predicted std rests on this "
+        f"record: ten other minutes of weather like it change it by {weather.unsteady:.0%} (1 sigma), and its "
+        "fit has an error.</p>",
         _image(folder, "weather.png"),
     ]
     if not folder.done("design"):

@@ -150,7 +150,8 @@ class Candidate:
     # After the demanded step of the leak: largest excursion, and duration
     load_peak_um: float
     load_recovery_s: float
-    sigma: loop_model.LoopFigures | None = None  # of the figures, from the fit's covariance
+    # Of the figures, from the fit's covariance; of the standard deviation, also from how steady the weather was
+    sigma: loop_model.LoopFigures | None = None
 
     @property
     def figures(self) -> loop_model.LoopFigures:
@@ -271,6 +272,9 @@ def propose(
         spread = prediction.half_widths(
             [prediction.loop_figures(gains, plant, disturbance, around, step) for plant in plants]
         )
+        if made.predicted is not None:
+            weather_um = made.predicted.std_um * disturbance.unsteady
+            spread = replace(spread, std_um=math.hypot(spread.std_um, weather_um))
         return replace(made, sigma=spread)
 
     designed = [row(name, gains, settled) for name, gains in designs(model, disturbance, settled, demands).items()]

@@ -44,7 +44,8 @@ def shown(rows: tuple[design.Candidate, ...], title: str, leak_um_per_s: float) 
     step = candidates.Demands().load_step_um_per_s
     caption = (
         f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
-        "+-: 1 sigma of the fit; the weather of another hour changes every std alike."
+        "+-: 1 sigma of the fit; for std with ten other minutes of weather like the observed, which change every std "
+        "alike."
     )
     return Group(figures, "", words, "", caption)
 
