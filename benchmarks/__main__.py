@@ -35,6 +35,7 @@ NAMES = (
     "calibration",
     "calibration_time",
     "coverage",
+    "benches",
     "recording",
     "memory",
     "soak",

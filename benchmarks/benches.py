@@ -15,6 +15,7 @@ import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import CommandError
@@ -29,12 +31,13 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import second_world
-from tuning import command, gains_file, opening, session
+from tuning import command, gains_file, opening, report, session
 from tuning.opening import TuneOptions, TwinHold
 
 DEFAULT_FILE = Path("build/benches.jsonl")
 SETTLE_S, HOLD_S = 120.0, 600.0
 LIMIT_UM = 10.0  # of the experiments: `tune run --limit-um`
+FRESH = 3  # benches of `make bench`, others every day
 SOUND = 1.2  # least ratio of full flow to leak of a bench that can be held
 
 
@@ -147,6 +150,7 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     with (
         tempfile.TemporaryDirectory() as folder,
         patch.object(opening, "TwinHold", opened),
+        patch.object(report, "write_report"),  # its pictures take as long as the session
     ):
         told = io.StringIO()
         try:
@@ -228,6 +232,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     kept = [row for row in rows if outcome(row) == "kept"]
     ratio = np.array([row["tuned_um"] / row["least_um"] for row in kept if "tuned_um" in row])
     said = np.array([row["predicted_um"] / row["tuned_um"] for row in kept if "tuned_um" in row])
+    off = [(row["predicted_um"] - row["tuned_um"]) / row["predicted_sigma_um"] for row in kept if "tuned_um" in row]
     default = np.array([row["default_um"] / row["least_um"] for row in rows if "default_um" in row])
     lines = ["| of the drawn benches | |", "|---|---|", f"| examined | {len(rows)} |"]
     words = [outcome(row) for row in rows]
@@ -236,7 +241,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         lines += [
             f"| std with defaults / bound: median, worst | {np.median(default):.2f}, {default.max():.2f} |",
             f"| std after tuning / bound: median, worst | {np.median(ratio):.2f}, {ratio.max():.2f} |",
+            f"| predicted over achieved | {said.min():.2f} to {said.max():.2f}, median {np.median(said):.2f} |",
             f"| predicted within 20 % of achieved | {np.mean(abs(said - 1) <= 0.2):.0%} |",
+            f"| achieved within 2 sigma of the prediction | {np.mean(np.abs(off) <= 2):.0%} |",
         ]
     lines.append(
         f"| excursion above {LIMIT_UM:g} um | {sum(row.get('excursion_um', 0) > LIMIT_UM for row in rows)} |"
@@ -248,6 +255,21 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         if outcome(row) != "kept" or over:
             lines.append(f"| {row['seed']}: {_short(row)} | {outcome(row)} | {why}{over} |")
     return "\n".join(lines)
+
+
+def run(count: int = FRESH) -> list[Figure]:
+    """Figures of `make bench`: benches that nobody has seen, beside the stored table of docs/tuning.md."""
+    first = 1000 + FRESH * datetime.now(UTC).toordinal()
+    rows = [_one(seed) for seed in range(first, first + count)]
+    kept = [row for row in rows if "tuned_um" in row]
+    figures = [at_least("kept gains", 100 * len(kept) / count, "%", 95.0)]
+    figures.append(at_most("furthest excursion", max(row.get("excursion_um", 0.0) for row in rows), "um", LIMIT_UM))
+    if kept:
+        ratio = float(np.median([row["tuned_um"] / row["least_um"] for row in kept]))
+        said = max(abs(row["predicted_um"] / row["tuned_um"] - 1) for row in kept)
+        figures.append(at_most("std after tuning over the bound, median", ratio, "", 1.25))
+        figures.append(at_most("predicted std against achieved, worst", 100 * said, "%", 20.0))
+    return figures
 
 
 def _short(row: dict[str, Any]) -> str:
@@ -262,7 +284,7 @@ def main() -> None:
     """Examine what is missing in the file, then print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--benches", type=int, default=200)
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--file", type=Path, default=DEFAULT_FILE)
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)

@@ -107,7 +107,7 @@ class CentreMotion:
 
 _IN_HAND_SIGMAS = 3.0
 # Of the limit, for the noise: with more, the noise stops sound experiments; longer filters see motion later
-_IN_HAND_SHARE = 0.2
+_IN_HAND_SHARE = 0.22
 _STRETCHES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
 
