@@ -69,7 +69,7 @@ class Rig:
         while True:
             wanted = guard.step(self._last, self.dt_s)
             if isinstance(wanted, machine.Finished):
-                self._loop.follow(self._given(0.0), holding_flow_um_per_s, self.dt_s)
+                self._loop.resume(self._given(0.0), holding_flow_um_per_s, self.dt_s)
                 return Record.from_samples(self.dt_s, flows, samples), wanted
             out = self._loop.follow(self._given(0.0), wanted, self.dt_s)
             flows.append(out.flow_um_per_s)

@@ -51,7 +51,8 @@ NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
-    Call exactly one of `step`, `stale` and `follow` per tick; they may follow each other without a bump.
+    Call exactly one of `step`, `stale`, `follow` and `resume` per tick; the first three may follow each other without
+    a bump.
     """
 
     def __init__(self, loop: LoopConfig, pump: PumpConfig) -> None:
@@ -180,6 +181,16 @@ class InnerLoop:
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         filtered_um = self._measured.value if seen else math.nan
         return replace(self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um), error_um=math.nan)
+
+    def resume(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
+        """`follow` with the flow that holds the mirror on average: what answers the weather then comes on top.
+
+        Were the weather's present share taken out of the mean, as `follow` does for a flow that a person has set, the
+        integrator would stand wrong by a gust's worth.
+        """
+        output = self.follow(given, mean_um_per_s, dt_s)
+        self._pid.place(self._limiter.flow_um_per_s)
+        return output
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
         """`follow` with a raw pump command, which is output unchanged; whether the pump runs is unknown."""

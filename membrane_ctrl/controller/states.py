@@ -134,7 +134,7 @@ def tune(scene: Scene) -> State:
     else:
         wanted = trial.step(measurement, scene.dt_s)
     if isinstance(wanted, Finished):
-        scene.give(scene.loop.follow(given, trial.spec.holding_flow_um_per_s, scene.dt_s))
+        scene.give(scene.loop.resume(given, trial.spec.holding_flow_um_per_s, scene.dt_s))
         scene.trial_ended = wanted
         scene.why = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
         return State.HOLD

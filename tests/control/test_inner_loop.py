@@ -113,6 +113,19 @@ def test_manual_to_automatic_is_bumpless(flow: float, displacement: float, trim:
     assert inner.step(there, DT_S).flow_wanted_um_per_s == pytest.approx(flow, abs=1e-3)
 
 
+def test_a_gust_at_the_end_of_an_experiment_does_not_shift_the_mean_flow() -> None:
+    """Air that rises by 5 Pa/s for a moment; then it is still, and the mean flow holds."""
+    inner, _ = settled()
+    for k in range(100):
+        risen = LoopInput(0.0, 0.0, 0.0, 101_325.0 + 5.0 * k * DT_S, 20.0)
+        inner.follow(risen, 1.2, DT_S)
+    inner.resume(risen, 1.2, DT_S)
+    assert inner.mean_flow_um_per_s == pytest.approx(1.2)
+    for _ in range(250):
+        out = inner.step(risen, DT_S)
+    assert out.flow_um_per_s == pytest.approx(1.2, abs=0.02)
+
+
 def test_automatic_to_manual_at_the_present_flow_is_bumpless() -> None:
     inner, before = settled()
     after = inner.follow(given_at(0.0), before.flow_um_per_s, DT_S)

@@ -119,10 +119,11 @@ class PumpSurvey:
 
     @property
     def holding(self) -> float:
-        """The command that balances the leak, as far as it is known by now."""
-        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        """The command that balances the leak, once there is one above and one below it."""
+        fractions, flows = self._sure()
         leak = self.fit.leak_um_per_s
-        return float(np.interp(leak, flows, fractions)) if 0 < leak < flows[-1] else self.holding_fraction
+        between = flows.size > 0 and flows[0] <= leak < flows[-1]
+        return float(np.interp(leak, flows, fractions)) if between else self.holding_fraction
 
     def known(self, level: Level) -> bool:
         """Whether its flow is known well enough."""
