@@ -132,9 +132,10 @@ def _likeliest(
         shares = _shares(logs, basis)
         return np.asarray(shares * count @ shares.T + likely.T @ likely)
 
-    options = {"gtol": 1e-2, "maxiter": 200}
-    found = minimize(cost, start, jac=True, hess=information, method="trust-exact", options=options).x
-    return np.maximum(found, math.log(_FLOOR))
+    found = minimize(
+        cost, start, jac=True, hess=information, method="trust-exact", options={"gtol": 1e-2, "maxiter": 200}
+    ).x
+    return np.asarray(np.maximum(found, math.log(_FLOOR)), dtype=float)
 
 
 def _shares(logs: records.Series, basis: records.Series) -> records.Series:
@@ -323,7 +324,7 @@ def _unsteady(
 
     From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves the movement.
     """
-    w: records.Series = 2 * np.pi * np.fft.rfftfreq(read_um.size, found.rest.dt_s)
+    w = np.asarray(2 * np.pi * np.fft.rfftfreq(read_um.size, found.rest.dt_s), dtype=float)
     w[0] = w[1]
     moving = found.psd(w, model, loop)
     centre_um = np.fft.irfft(
