@@ -9,8 +9,9 @@ from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetA
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
+    """Add `measure`, `track`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
     app.command()(measure)
+    app.command()(track)
     app.command()(export_figure)
     app.command()(film)
     app.command()(uncertainty)
@@ -36,6 +37,19 @@ def measure(
     return measure_command(
         MeasureOptions(capture_set, geometry, out, json, pictures, rerun, nominal_radius_mm, report)
     )
+
+
+def track(
+    capture_set: SetArgument,
+    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the reference's own.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; SET/result by default.")] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw track.png and write track.rrd next to the result.")] = True,
+    json: JsonOption = False,
+) -> int:
+    """Track the figure through the frames of one crossed pattern: a figure for every frame."""
+    from membrane_ctrl.measure.track import TrackOptions, track_command
+
+    return track_command(TrackOptions(capture_set, geometry, out, json, pictures))
 
 
 def export_figure(
@@ -171,6 +185,10 @@ def simulate(
         list[float] | None,
         typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable."),
     ] = None,
+    track: Annotated[
+        int, typer.Option(min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full.")
+    ] = 0,
+    rate_hz: Annotated[float, typer.Option(min=0.01, help="Frames of a tracking set per second.")] = 20.0,
 ) -> int:
     """Simulate a capture set, or a run of sets, with known truth."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command
@@ -195,5 +213,7 @@ def simulate(
         sets=sets,
         interval_s=interval_s,
         coarser_mm=tuple(coarser_mm or ()),
+        track=track,
+        rate_hz=rate_hz,
     )
     return simulate_command(options)

@@ -128,7 +128,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     rows = _ordered(content, path)
     reference = None
     for row in content.frames:
-        _require_inside(row.file, folder, path)
+        require_inside(row.file, folder, path)
     if content.kind == "fringes":
         if content.reference is None:
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
@@ -165,7 +165,7 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
             "for a set"
         )
     with ThreadPoolExecutor(_READERS) as pool:
-        images = list(pool.map(_read_image, [head.folder / name for name in head.files]))
+        images = list(pool.map(read_image, [head.folder / name for name in head.files]))
     return assemble(head, images)
 
 
@@ -227,7 +227,7 @@ def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: f
     return optics.model_copy(update={"geometry": geometry.model_copy(update=update)})
 
 
-def _read_image(path: Path) -> Image | str:
+def read_image(path: Path) -> Image | str:
     """The image, or the reason for its absence."""
     try:
         image = decoded_image(read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_UNCHANGED)
@@ -254,7 +254,7 @@ def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
     return bits
 
 
-def _require_inside(name: str, folder: Path, path: Path) -> None:
+def require_inside(name: str, folder: Path, path: Path) -> None:
     """Raise InputError for a frame that is not the set's own: a set may come from anywhere."""
     try:
         inside = bool(name) and (folder / name).resolve().is_relative_to(folder.resolve())

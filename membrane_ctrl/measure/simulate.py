@@ -32,7 +32,12 @@ class SimulateOptions:
     faults: tuple[str, ...]
     sets: int
     interval_s: float
+<<<<<<< HEAD
     coarser_mm: tuple[float, ...] = ()
+=======
+    track: int = 0  # frames of a tracking set
+    rate_hz: float = 20.0
+>>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
 
 
 def simulate_command(options: SimulateOptions) -> int:
@@ -42,13 +47,16 @@ def simulate_command(options: SimulateOptions) -> int:
     try:
         spec = specification(options)
         with errors.writing(options.folder):
-            if options.sets == 1:
+            if options.track:
+                simulate.simulate_track(options.folder, spec, options.track, options.rate_hz, _progress(options.track))
+            elif options.sets == 1:
                 simulate.simulate_set(options.folder, spec)
             else:
                 simulate.simulate_run(options.folder, spec, options.sets, options.interval_s, _progress(options.sets))
     except ValueError as error:
         raise errors.InputError(f"simulate: {error}") from None
-    print(f"{options.sets} set(s) written to {options.folder}", file=sys.stderr)
+    written = f"{options.track} frames and their reference" if options.track else f"{options.sets} set(s)"
+    print(f"{written} written to {options.folder}", file=sys.stderr)
     return 0
 
 
@@ -101,8 +109,8 @@ def _optics(options: SimulateOptions) -> OpticsConfig:
     )
 
 
-def _progress(sets: int) -> Callable[[int], None] | None:
-    """Count the sets in one line, on a terminal only."""
+def _progress(total: int) -> Callable[[int], None] | None:
+    """Count sets, or frames, in one line, on a terminal only."""
     if not sys.stderr.isatty():
         return None
-    return lambda done: terminal.live_line(f"{done} of {sets} sets", "" if done < sets else "\n")
+    return lambda done: terminal.live_line(f"{done} of {total}", "" if done < total else "\n")

@@ -88,11 +88,11 @@ class OpticsRenderer:
         shade(
             self._nodes(displacement_um),
             self._weights,
-            1 if pattern.axis == "y" else 0,
+            2 if pattern.role == "crossed" else int(pattern.axis == "y"),
             self.film.radius_mm,
             config.periods * config.period_mm,
             (table.values, table.cell_mm, table.smooth),
-            np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full]),
+            np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full, self.light.gamma]),
             self._loss,
             (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
             picture,

@@ -55,15 +55,15 @@ def _random_64(state: np.uint64) -> np.uint64:
 
 
 @njit(cache=True)
-def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
-    """Light of the screen at s from the region's low edge; the caller ensures 0 <= s < side."""
+def _level(s_mm: float, values: FloatArray, row: int, cell_mm: float, smooth: bool) -> float:
+    """Value of a row of the table at s from the region's low edge; the caller ensures 0 <= s < side."""
     place = s_mm / cell_mm
     cell = int(place)
     if not smooth:
-        return float(values[min(cell, len(values) - 1)])
+        return float(values[row, min(cell, values.shape[1] - 1)])
     fraction = place - cell
-    cell %= len(values) - 1
-    return float(values[cell] + fraction * (values[cell + 1] - values[cell]))
+    cell %= values.shape[1] - 1
+    return float(values[row, cell] + fraction * (values[row, cell + 1] - values[row, cell]))
 
 
 @njit(cache=True)
@@ -91,11 +91,12 @@ def shade(
     # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2)
     nodes: FloatArray,
     weights: FloatArray,  # (step, 4) of `cubic_weights`
-    axis: int,  # 0: the pattern runs along s_x, 1: along s_y
+    axis: int,  # 0: the pattern runs along s_x, 1: along s_y, 2: along both
     radius_mm: float,  # of the film's rim
     side_mm: float,  # of the pattern region
     table: tuple[FloatArray, float, bool],  # the fields of a `LevelTable`
-    # (4,): counts without light, counts of a white screen above that, light outside the region (share), full scale
+    # (5,): counts without light, counts of a white screen above that, light outside the region (share), full scale,
+    # gamma
     scale: FloatArray,
     loss: tuple[FloatArray, FloatArray],  # vignetting (W,), (H,): a column's part and a row's
     noise: tuple[Singles, float, int],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
@@ -105,7 +106,7 @@ def shade(
     step = weights.shape[0]
     height, width = out.shape
     values, cell_mm, smooth = table
-    dark, white, leak, full = scale
+    dark, white, leak, full, gamma = scale
     column_loss, row_loss = loss
     quantiles, sigma, seed = noise
     radius2_mm2 = radius_mm * radius_mm
@@ -125,7 +126,10 @@ def shade(
                     s_y_mm = _between(line_y, cell, weights, k)
                     light = leak
                     if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
-                        light = _level(s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth)
+                        light = _level(s_y_mm if axis == 1 else s_x_mm, values, 0, cell_mm, smooth)
+                        if axis == 2:
+                            light = max(0.0, light + _level(s_y_mm, values, 1, cell_mm, smooth))
+                            light = leak + (1.0 - leak) * light**gamma
                     counts += white * light * (1.0 - column_loss[column] - row_loss[row])
                 if sigma > 0.0:
                     if column & 3 == 0:  # four 16-bit numbers from each 64-bit one
@@ -177,10 +181,11 @@ class LevelTable:
     """Light along an axis in cells `cell_mm` wide.
 
     A smooth table is one period, repeated and interpolated, with one value more than cells so that the last cell has
-    an end; the other has one value per cell over the whole region.
+    an end; the other has one value per cell over the whole region. Crossed fringes have two rows, x and y, of the
+    levels that add up to the pattern before the panel makes light of them.
     """
 
-    values: FloatArray
+    values: FloatArray  # (1 or 2, cells)
     cell_mm: float
     smooth: bool
 
@@ -189,15 +194,24 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     """Light of a pattern along its axis.
 
     - "sin": (1 + cos(phi + shift)) / 2 with phi = 2 pi s / T - pi, over one period, to be repeated;
+    - "crossed": (1 + cos(phi_x + shift_x) + 1 + cos(phi_y + shift_y)) / 4 with `index` periods over the region;
     - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
     - "white" and "black": 1 and 0 over the region.
 
     Raises ValueError if the pattern's role or Gray bit is unknown.
     """
+    phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
     if pattern.role == "sin":
-        phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
+<<<<<<< HEAD
         return LevelTable(_lit(levels, light), (pattern.period_mm or config.period_mm) / _SINE_CELLS, smooth=True)
+=======
+        return LevelTable(_lit(levels, light)[None], config.period_mm / _SINE_CELLS, smooth=True)
+    if pattern.role == "crossed" and pattern.index > 0:
+        both = np.stack([1.0 + np.cos(phi + shift) for shift in (pattern.shift_rad, pattern.shift_y_rad)])
+        period_mm = config.periods * config.period_mm / pattern.index
+        return LevelTable(both / 4.0, period_mm / _SINE_CELLS, smooth=True)
+>>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
     half_periods = np.arange(2 * config.periods)
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
         codes = half_periods ^ (half_periods >> 1)
@@ -205,8 +219,8 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     elif pattern.role in ("white", "black"):
         levels = np.full(half_periods.shape, 1.0 if pattern.role == "white" else 0.0)
     else:
-        raise ValueError(f"pattern {pattern.name!r}: role must be sin, gray (bit 1..4), white or black")
-    return LevelTable(_lit(levels, light), config.period_mm / 2.0, smooth=False)
+        raise ValueError(f"pattern {pattern.name!r}: role must be sin, crossed, gray (bit 1..4), white or black")
+    return LevelTable(_lit(levels, light)[None], config.period_mm / 2.0, smooth=False)
 
 
 def pattern_sequence(

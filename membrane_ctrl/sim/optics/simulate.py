@@ -165,6 +165,58 @@ def simulate_run(
             on_set(number + 1)
 
 
+_CROSSED_PERIODS = 32
+_STEPS = 5  # of the first frames: 72 degrees in x, twice that in y
+
+
+def simulate_track(
+    folder: str | Path,
+    spec: SimulationSpec,
+    frames: int,
+    rate_hz: float = 20.0,
+    on_frame: Callable[[int], None] | None = None,
+) -> None:
+    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; one clock and one motion for both.
+
+    The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`, `sag_um` (frames,)
+    and, if 36 terms represent the film, `coeffs_um` (frames, 36). `on_frame` gets the number of frames written. Raises
+    ValueError as `simulate_run`, and for a rate that is no number.
+    """
+    if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:
+        raise ValueError("track: one frame or more, at a rate above 0, of a film that moves by motion")
+    spec = _anchored(spec)
+    renderer, target = _renderer(spec), Path(folder) / "track"
+    _write_set(Path(folder) / "full", spec, renderer)
+    target.mkdir(parents=True, exist_ok=True)
+    start_s = spec.start_s + len(spec.patterns) * spec.frame_interval_s
+    time_s = start_s + np.arange(frames) / rate_hz
+    displacement_um = np.array([spec.motion.at_um(float(t)) for t in time_s])
+    noise_um = np.random.default_rng(spec.seed + 1).normal(0.0, spec.laser_noise_um, frames)
+    rows = []
+    for k in range(frames):
+        shift_x, shift_y = (turns * 2 * np.pi * (k % _STEPS) / _STEPS if k < _STEPS else 0.0 for turns in (1, 2))
+        pattern = roles.Pattern("crossed", "", _CROSSED_PERIODS, shift_x, shift_y)
+        row: dict[str, Any] = {"file": f"t_{k:05d}.png", "role": "crossed"}
+        row |= {"shift_x_rad": shift_x, "shift_y_rad": shift_y, "time_s": round(float(time_s[k]), 9)}
+        if spec.laser:
+            row["displacement_um"] = float(displacement_um[k] + noise_um[k])
+        _write_png(target / row["file"], renderer.render(pattern, float(displacement_um[k])))
+        rows.append(row)
+        if on_frame is not None:
+            on_frame(k + 1)
+    pattern_mm = spec.optics.pattern
+    crossed = {"periods": _CROSSED_PERIODS, "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS}
+    table = {"schema": "membrane-capture/1", "kind": "track", "reference": "../full"}
+    table |= {"pattern": _written(pattern_mm) | {"crossed": crossed}, "frames": rows}
+    (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
+    sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
+    truth = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
+    coeffs = [spec.film.coeffs_um(float(d)) for d in displacement_um]
+    if coeffs[0] is not None:
+        truth["coeffs_um"] = np.array(coeffs)
+    np.savez_compressed(target / "truth.npz", **truth)
+
+
 def _anchored(spec: SimulationSpec) -> SimulationSpec:
     """The specification with an explicit reference displacement of the geometry, common to all sets of a run."""
     stated = spec.stated_geometry or spec.optics.geometry

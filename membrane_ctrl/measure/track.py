@@ -1,0 +1,297 @@
+"""The `track` command: the figure of every frame of a crossed pattern (docs/interfaces.md, section 3b)."""
+
+import io
+import json
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from firmware_iface.settings import Section
+from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.geometry.file import GeometryFile, read_geometry
+from membrane_ctrl.measure.capture_set import read_image, require_inside
+from membrane_ctrl.measure.measurement import Figures, SetFigure
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, separable
+from membrane_ctrl.metrology.track.scene import scene_of
+from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
+from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model.arrays import FloatArray, Image
+
+_SAME_REGION = 1e-4  # of its side: rounding of written decimals
+_NAMED = 5  # reasons shown
+_SHOWN_FRAMES = 2000  # of a picture
+
+
+class CrossedConfig(Section):
+    """`[pattern.crossed]`: fringes of both axes at once."""
+
+    periods: Annotated[int, Field(ge=2, le=1000)]
+    period_mm: Annotated[float, Field(ge=0.1, le=2000)]
+    contrast: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class TrackPattern(schema.PatternConfig):
+    """`[pattern]`: the reference's, and the crossed one."""
+
+    crossed: CrossedConfig
+
+
+class TrackRow(Section):
+    """One `[[frames]]` table."""
+
+    file: str
+    role: Literal["crossed"]
+    shift_x_rad: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0
+    shift_y_rad: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0
+    time_s: Annotated[float, Field(allow_inf_nan=False)]
+    displacement_um: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
+
+
+class TrackFile(Section):
+    """The content of a tracking set's `capture.toml`."""
+
+    schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
+    kind: Literal["track"]
+    reference: str
+    pattern: TrackPattern
+    frames: Annotated[tuple[TrackRow, ...], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Options of the command."""
+
+    folder: Path
+    geometry: Path | None = None
+    out: Path | None = None
+    as_json: bool = False
+    pictures: bool = True
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a tracking set gave."""
+
+    frames: tuple[TrackedFrame, ...]
+    stepped: bool  # whether it began with five steps that could be used
+    residual_adu: FloatArray  # (rows, columns): mean of what the fits left, over the bins; NaN outside
+
+    def columns(self) -> dict[str, Any]:
+        """The arrays of `track.npz`."""
+        numbers = ("time_s", "coeffs_um", "sigma_um", "hencky_um", "sag_um", "sag_sigma_um")
+        words = ("verdict", "reason")
+        return {name: np.array([getattr(frame, name) for frame in self.frames]) for name in (*numbers, *words)}
+
+
+def track_command(options: TrackOptions) -> int:
+    """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
+    folder = options.folder
+    begin = time.perf_counter()
+    track = track_set(folder, None if options.geometry is None else read_geometry(options.geometry))
+    passed_s = time.perf_counter() - begin
+    out = options.out.resolve() if options.out else folder / "result"
+    table = _table(track)
+    with errors.writing(out):
+        files.make_folder(out)
+        _write_columns(out / "track.npz", track)
+        if options.pictures:
+            _show(out, track, _lines(table))
+    rate = len(track.frames) / passed_s
+    print(f"written to {out}; {rate:.1f} frames/s with reading them", file=sys.stderr)
+    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    return int(errors.Exit.DONE if table["usable"] else errors.Exit.REJECTED)
+
+
+def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
+    """The figures of a set's frames. Raises InputError if the set or its reference is invalid."""
+    content = read_track(folder)
+    path = folder / "capture.toml"
+    reference = Figures(geometry).of((folder / content.reference).resolve())
+    _require_reference(content, reference, path)
+    crossed, optics = content.pattern.crossed, reference.head.optics
+    try:
+        scene = scene_of(optics, reference.checked, reference.figure, crossed.period_mm, crossed.contrast)
+    except ValueError as error:
+        raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
+    size = (optics.camera.height_px, optics.camera.width_px)
+    tracker = Tracker(
+        scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um
+    )
+    shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
+    pictures = _pictures(content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16))
+    first: list[Image | str] = []
+    stepped = len(shifts) >= ENOUGH_STEPS and separable(shifts[: ENOUGH_STEPS])
+    if stepped:
+        first = [next(pictures) for _ in range(ENOUGH_STEPS)]
+        good = [picture for picture in first if not isinstance(picture, str)]
+        stepped = len(good) == ENOUGH_STEPS and tracker.anchor(good, shifts[: ENOUGH_STEPS])
+    found = []
+    rows = zip(content.frames, chain(first, pictures), strict=True)
+    for row, picture in terminal.counted(rows, "frames", len(content.frames)):
+        reading = math.nan if row.displacement_um is None else row.displacement_um
+        if isinstance(picture, str):
+            found.append(tracker.missed(row.time_s, picture))
+        else:
+            found.append(tracker.follow(picture, (row.shift_x_rad, row.shift_y_rad), row.time_s, reading))
+    return Track(tuple(found), stepped, tracker.mean_residual_adu())
+
+
+def read_track(folder: Path) -> TrackFile:
+    """The content of a set's `capture.toml`, checked. Raises InputError."""
+    path = folder / "capture.toml"
+    if not folder.is_dir():
+        raise errors.InputError(f"{folder}: no such tracking set")
+    tables = toml_file.read_toml(path, follow=False)
+    if tables.get("kind") in ("full", "fringes"):
+        raise errors.InputError(f"{path}: kind: a {tables['kind']} set; use `membrane-ctrl measure`")
+    for key in toml_file.prune(tables, TrackFile):
+        print(f"{path}: {key}: unknown key, ignored", file=sys.stderr)
+    content = toml_file.parse(tables, TrackFile, str(path))
+    for row in content.frames:
+        require_inside(row.file, folder, path)
+    for before, after in pairwise(content.frames):
+        if not after.time_s > before.time_s:
+            raise errors.InputError(
+                f"{path}: frames: time_s of {after.file} is {after.time_s:g}, not after {before.time_s:g} of the "
+                "frame before"
+            )
+    for name, times in Counter(row.file for row in content.frames).items():
+        if times > 1:
+            raise errors.InputError(f"{path}: frames: {name} is given for {times} frames")
+    return content
+
+
+def _require_reference(content: TrackFile, reference: SetFigure, path: Path) -> None:
+    """Raise InputError unless the reference is a full set with the region of this one."""
+    if reference.head.kind != "full":
+        raise errors.InputError(f"{path}: reference: {reference.head.folder} is not a full set")
+    ours, theirs = content.pattern, reference.head.optics.pattern
+    for key in ("periods", "period_mm"):
+        if getattr(ours, key) != getattr(theirs, key):
+            said = f"{getattr(ours, key)}, the reference has {getattr(theirs, key)}"
+            raise errors.InputError(f"{path}: pattern.{key} = {said}")
+    sides = [pattern.periods * pattern.period_mm for pattern in (ours.crossed, theirs)]
+    if abs(sides[0] - sides[1]) > _SAME_REGION * sides[1]:
+        raise errors.InputError(
+            f"{path}: pattern.crossed: periods * period_mm = {sides[0]:g} mm; it covers the reference's region, "
+            f"{sides[1]:g} mm"
+        )
+
+
+def _pictures(
+    content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]
+) -> Iterator[Image | str]:
+    """The frames one after the other; a text where there is none. Raises InputError for another size or depth."""
+    for row in content.frames:
+        picture = read_image(folder / row.file)
+        if not isinstance(picture, str):
+            where = f"{folder / 'capture.toml'}: frames: {row.file} has"
+            if picture.shape != size:
+                seen = f"{picture.shape[1]} x {picture.shape[0]} pixels"
+                raise errors.InputError(f"{where} {seen}, the reference {size[1]} x {size[0]}")
+            if picture.dtype != depth:
+                raise errors.InputError(f"{where} {8 * picture.itemsize} bit pixels, the reference {8 * depth.itemsize}")
+        yield picture
+
+
+def _write_columns(path: Path, track: Track) -> None:
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **track.columns())
+    files.write_bytes_atomic(path, file.getvalue())
+
+
+def _table(track: Track) -> dict[str, Any]:
+    """The result in numbers."""
+    used = [frame for frame in track.frames if frame.verdict != "rejected"]
+    sag, sigma = (np.array([getattr(frame, name) for frame in used]) for name in ("sag_um", "sag_sigma_um"))
+    reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
+    counts = Counter(frame.verdict for frame in track.frames)
+    return {
+        "schema": "membrane-track/1",
+        "frames": len(track.frames),
+        "verdicts": {verdict: counts[verdict] for verdict in ("ok", "degraded", "rejected")},
+        "usable": len(used),
+        "stepped": track.stepped,
+        "seconds": track.frames[-1].time_s - track.frames[0].time_s,
+        "sag_mean_um": float(sag.mean()) if used else None,
+        "sag_sd_um": float(sag.std()) if used else None,
+        "sag_sigma_um": float(np.median(sigma)) if used else None,
+        "reasons": dict(reasons.most_common()),
+    }
+
+
+def _lines(table: dict[str, Any]) -> list[str]:
+    """The result as lines of text."""
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in table["verdicts"].items() if count)
+    lines = [f"frames    {table['frames']} in {table['seconds']:.1f} s: {verdicts}"]
+    lines += [f"          {count} x {reason}" for reason, count in list(table["reasons"].items())[:_NAMED]]
+    light = "five steps of the first frames" if table["stepped"] else "the reference"
+    lines.append(f"anchor    light and phases of the bins from {light}")
+    if table["usable"]:
+        lines.append(
+            f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation {table['sag_sd_um']:.3f} um, "
+            f"1 sigma of a frame {table['sag_sigma_um']:.3f} um"
+        )
+    return lines
+
+
+def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
+    """Write `track.png` and `track.rrd`. Raises OSError."""
+    import rerun as rr
+
+    from membrane_ctrl.measure.pictures import log_pictures, result_recording
+
+    columns = track.columns()
+    time_s, sag_um, sigma_um = columns["time_s"], columns["sag_um"], columns["sag_sigma_um"]
+    change_um = columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0) if np.isfinite(sag_um).any() else None
+    drawn = [_draw(out / "track.png", columns, change_um, track.residual_adu)]
+    with result_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
+        recording.log("track/report", rr.TextDocument("\n".join(lines)), static=True)
+        at = [rr.TimeColumn("run_time", duration=time_s)]
+        recording.send_columns("track/sag_um", at, rr.Measurements.columns(values=sag_um, variances=sigma_um**2))
+        if change_um is not None:
+            names = [f"Z{j}" for j in range(2, 37)]
+            recording.log("track/terms_um", rr.SeriesLines(names=names), static=True)
+            recording.send_columns("track/terms_um", at, rr.Scalars.columns(scalars=change_um[:, 1:]))
+        states = [f"{frame.verdict} {frame.reason}".strip() for frame in track.frames]
+        for k, (frame, state) in enumerate(zip(track.frames, states, strict=True)):
+            if k == 0 or state != states[k - 1]:
+                recording.set_time("run_time", duration=frame.time_s)
+                recording.log("track/verdict", rr.TextLog(state))
+        log_pictures(recording, "track/pictures", drawn)
+
+
+def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray) -> Path:
+    """Draw the terms over time, the sag with its band, and what the fits left."""
+    from membrane_ctrl.measure.pictures import sheet
+    from membrane_ctrl.measure.results import write_figure
+
+    figure, (terms, sag, left) = sheet(9, 13, 3, 1)
+    every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
+    time_s, sag_um, sigma_um = (columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um"))
+    if change_um is not None:
+        shown = change_um[::every, 3:].T
+        most = float(np.nanquantile(np.abs(shown), 0.995)) or 1.0
+        extent = (time_s[0], time_s[-1] + 1e-9, 36.5, 3.5)
+        style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -most, "vmax": most, "interpolation": "nearest"}
+        bar = terms.imshow(shown, aspect="auto", extent=extent, **style)
+        figure.colorbar(bar, ax=terms)
+        middle = np.nanmean(sag_um)
+        sag.plot(time_s, sag_um - middle, linewidth=0.8)
+        sag.fill_between(time_s, sag_um - middle - sigma_um, sag_um - middle + sigma_um, alpha=0.3)
+        sag.set(title=f"sag less {middle / 1e3:.4f} mm (um), band of 1 sigma")
+    terms.set(title="terms less their means (um RMS)", xlabel="time (s)", ylabel="Noll index")
+    sag.set(xlabel="time (s)", ylabel="um")
+    most = float(np.nanquantile(np.abs(residual_adu), 0.995)) or 1.0
+    figure.colorbar(left.imshow(residual_adu, cmap="RdBu_r", vmin=-most, vmax=most), ax=left)
+    left.set(title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins")
+    return write_figure(path, figure)

@@ -1,0 +1,271 @@
+"""The fit of one frame: Gauss-Newton on the light of its bins, for the surface and for what changes smoothly.
+
+With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
+W Tukey's weights and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is kept from step to step and frame to
+frame: where J^T W r vanishes is the solution whatever matrix led there. It is made anew where steps shrink too slowly.
+
+Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
+that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
+A, z_x, z_y of a bin; l and b are the maps that the fits found. The angles of z are shape that the surface lacks: what
+36 terms can represent moves the surface, the rest stays with the bin.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.optics import kernels
+from membrane_ctrl.metrology.optics.compiled import kernel, split
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
+from membrane_ctrl.metrology.optics.zernike import TERMS
+from membrane_ctrl.metrology.track.scene import CrossedScene
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
+
+TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
+_MAX_STEPS = 15
+_LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivatives: nanometres off at most
+_SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
+# Tukey's weight reaches 0 here: noise keeps its weight, dust and glints have none
+_TUKEY_SIGMAS = 7.0
+_UNKNOWNS = PARAMETERS + 3 * TERMS
+_BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
+
+
+ENOUGH_STEPS = 5  # they separate level, two swings and two phases
+_FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not
+
+
+@kernel
+def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  # type: ignore[no-untyped-def]
+    """Rows of `out` (7, n): w r dI/dphi_x, w r dI/dphi_y, w r, w r cos x, w r cos y; residual r, weight w.
+
+    `maps` (3, n) are level and swings, `reach` (n,) is where Tukey's weight ends; 0 leaves a bin out.
+    """
+    bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
+    for p in range(start, stop):
+        x = base[0, p] + turn[0, p] + shifts[0]
+        y = base[1, p] + turn[1, p] + shifts[1]
+        cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
+        light = maps[0, p] + maps[1, p] * cx + maps[2, p] * cy
+        steep_x, steep_y = maps[1, p], maps[2, p]
+        if bent:
+            v = 0.5 + 0.25 * (cx + cy)
+            most = 2 * (steep_x + steep_y)
+            power, slope, h = v, 0.0, 0.0
+            for k in range(4):
+                slope += response[k] * ((k + 2) * power - 1)
+                power *= v
+                h += response[k] * (power - v)
+            light += most * h
+            steep_x += most * slope / 4
+            steep_y += most * slope / 4
+        r = seen[p] - light
+        u = r / reach[p] if reach[p] > 0 else 1.0
+        w = (1 - u * u) * (1 - u * u) if u * u < 1 else 0.0
+        out[0, p] = -w * r * steep_x * sx
+        out[1, p] = -w * r * steep_y * sy
+        out[2, p] = w * r
+        out[3, p] = w * r * cx
+        out[4, p] = w * r * cy
+        out[5, p] = r
+        out[6, p] = w
+
+
+@dataclass(frozen=True)
+class FrameFit:
+    """Solution of one frame."""
+
+    surface: Surface
+    light: FloatArray  # (3, 36): relative change of level and swings against the scene's, as Noll terms
+    residual_adu: Singles  # (n,): light less the model's
+    weights: Singles  # (n,): Tukey's
+    converged: bool
+
+
+class FrameFitter:
+    """Fits frame after frame.
+
+    Parameters
+    ----------
+    scene : CrossedScene
+        What a frame must show.
+    """
+
+    def __init__(self, scene: CrossedScene) -> None:
+        self.scene = scene
+        self.jacobian = scene.jacobian(scene.surface)
+        self._basis = scene.basis
+        self._traced = scene.surface
+        self._base = scene.phase_rad(scene.surface)
+        self._inverse: FloatArray | None = None
+        self._out = np.empty((7, scene.index.size), np.float32)
+        self._maps = np.empty((3, scene.index.size), np.float32)
+
+    def fit(
+        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
+    ) -> FrameFit:
+        """Fit a frame from the last solution.
+
+        Parameters
+        ----------
+        seen_adu : (n,) array
+            Means over the bins.
+        shifts_rad : (float, float)
+            Phase steps of x and y.
+        reach_adu : (n,) array
+            Residual from which a bin has no weight; 0 leaves it out.
+        """
+        shape, light, last = start.surface, start.light.copy(), math.inf
+        for _ in range(_MAX_STEPS):
+            self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)
+            if self._inverse is None:
+                self._inverse = self._inverted(shifts_rad, shape)
+            delta = self._inverse @ self._right()
+            shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
+            light += delta[PARAMETERS:].reshape(3, TERMS)
+            change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
+            if not change > TOLERANCE_MM:
+                break
+            if change > _SLOW * last:
+                self._inverse = None
+            last = change
+        residual, weights = self._out[5].copy(), self._out[6].copy()
+        return FrameFit(shape, light, residual, weights, change <= TOLERANCE_MM)
+
+    def _evaluate(
+        self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
+    ) -> None:
+        """Residual, weights and what the right side is made of, at a surface and maps of light."""
+        moved = shape.parameters - self._traced.parameters
+        if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
+            self._traced, self._base, moved = shape, self.scene.phase_rad(shape), np.zeros(PARAMETERS)
+        turn = moved.astype(np.float32) @ self.jacobian
+        np.matmul(light.astype(np.float32), self._basis, out=self._maps)
+        self._maps += 1
+        self._maps *= self.scene.light_adu
+
+        def run(start: int, stop: int) -> None:
+            fixed = (self._base, turn, np.array(shifts_rad), self._maps, self.scene.response)
+            _model(*fixed, seen_adu, reach, self._out, start, stop)
+
+        split(run, self.scene.index.size)
+
+    def _right(self) -> FloatArray:
+        """J^T W r (144,) of the last evaluation."""
+        of_surface = self.jacobian[0] @ self._out[0] + self.jacobian[1] @ self._out[1]
+        of_light = (self._out[2:5] * self.scene.light_adu) @ self._basis.T
+        return np.concatenate([of_surface, of_light.ravel()]).astype(float)
+
+    def _columns(self, shifts_rad: tuple[float, float], shape: Surface) -> Singles:
+        """J (144, n) for a straight panel."""
+        moved = (shape.parameters - self._traced.parameters).astype(np.float32)
+        x, y = self._base + moved @ self.jacobian + np.reshape(shifts_rad, (2, 1))
+        swing_x, swing_y = self._maps[1], self._maps[2]
+        level, first, second = self.scene.light_adu
+        out = np.empty((_UNKNOWNS, self.scene.index.size), np.float32)
+        out[:PARAMETERS] = -swing_x * np.sin(x) * self.jacobian[0] - swing_y * np.sin(y) * self.jacobian[1]
+        for k, wave in enumerate((level, first * np.cos(x), second * np.cos(y))):
+            out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self._basis * wave
+        return out
+
+    def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray:
+        """(J^T W J)^-1. Raises ValueError if the bins do not determine the unknowns."""
+        columns = self._columns(shifts_rad, shape)
+        matrix = ((columns * self._out[6]) @ columns.T).astype(float)
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        matrix *= np.outer(scale, scale)
+        if not kernels.invert(matrix):
+            raise ValueError("the frame does not determine the surface: too little of the mirror shows fringes")
+        return matrix * np.outer(scale, scale)
+
+    def covariance_mm2(
+        self, fit: FrameFit, shifts_rad: tuple[float, float], noise_adu: float
+    ) -> FloatArray:
+        """Covariance (36, 36) of the parameters from what the fit leaves, or from the noise where that is larger.
+
+        Errors of neighbouring bins belong together (light that wanders): what a square of 1.6 fringes contributes to
+        the solution counts as one error, and the squares as independent. Maps of light are refitted with the surface,
+        so that their errors are in it.
+        """
+        columns = self._columns(shifts_rad, fit.surface)
+        pull = ((self._inverse_now(shifts_rad, fit)[:PARAMETERS].astype(np.float32) @ columns) * (
+            fit.weights * fit.residual_adu
+        )).astype(float)
+        blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
+        count = int(blocks.max()) + 1
+        sums = np.stack([np.bincount(blocks, row, count) for row in pull])
+        used = np.count_nonzero(np.any(sums != 0, axis=0))
+        seen = sums @ sums.T * used / max(used - PARAMETERS, 1)
+        of_noise = noise_adu**2 * self._inverse_now(shifts_rad, fit)[:PARAMETERS, :PARAMETERS]
+        grown = np.sqrt(np.maximum(np.diag(seen), np.diag(of_noise)) / np.diag(seen))
+        return np.asarray(seen * np.outer(grown, grown))
+
+    def _inverse_now(self, shifts_rad: tuple[float, float], fit: FrameFit) -> FloatArray:
+        if self._inverse is None:
+            self._inverse = self._inverted(shifts_rad, fit.surface)
+        return self._inverse
+
+    def period_um(self) -> FloatArray:
+        """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
+        matrix = sum(j.astype(float) @ j.T for j in self.jacobian)
+        return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian])
+
+
+def squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
+    """Number (n,) of the square of the mirror, so many across, that each bin is in; numbers without gaps."""
+    column, row = np.floor((position_mm / radius_mm + 1) / 2 * across).astype(int)
+    return np.unique(row * across + column, return_inverse=True)[1]
+
+
+def separable(shifts_rad: FloatArray) -> bool:
+    """Whether steps (N, 2) of x and y separate the two axes."""
+    design = _design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
+    return len(design) >= ENOUGH_STEPS and bool(np.linalg.cond(design) < 10)
+
+
+def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
+    """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
+    x, y = phase_rad + shifts_rad
+    return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
+
+
+def stepped(
+    fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
+) -> tuple[CrossedScene, Surface]:
+    """The scene as the steps saw it, and the surface that belongs to it.
+
+    `fits` are those of the N single frames, `seen_adu` (N, n) their bins, `shifts_rad` (N, 2) their steps.
+    """
+    scene = fitter.scene
+    design = np.empty((scene.index.size, len(fits), 5))
+    rest = np.empty((scene.index.size, len(fits)))
+    for k, (fit, shifts) in enumerate(zip(fits, shifts_rad, strict=True)):
+        phases = scene.phase_rad(fit.surface)
+        maps = 1 + fit.light @ scene.basis
+        design[:, k] = _design(phases, shifts[:, None]) * maps[[0, 1, 1, 2, 2]].T
+        rest[:, k] = seen_adu[k] - scene.harmonics_adu(phases + shifts[:, None])
+    turned = np.swapaxes(design, 1, 2)
+    solved = np.linalg.solve(turned @ design, turned @ rest[..., None])[..., 0]
+    swing = np.hypot(solved[:, 1::2], solved[:, 2::2]).T
+    off_rad = np.arctan2(solved[:, 2::2], solved[:, 1::2]).T
+    good = (np.abs(off_rad) < _FAR_RAD).all(axis=0) & (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
+    moved, left_rad = _split(fitter, off_rad, swing * good)
+    middle = np.mean([fit.surface.parameters for fit in fits], axis=0)
+    light = np.stack([solved[:, 0], *swing])
+    return (
+        scene.with_light(np.where(good, light, scene.light_adu), scene.beyond_mm + good * left_rad / scene.rad_per_mm),
+        Surface.from_parameters(middle + moved, scene.surface.radius_mm),
+    )
+
+
+def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Phases (2, n) as a change of the surface's parameters (36,), and what is left of them."""
+    jacobian = fitter.jacobian
+    matrix, right = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    for axis in range(2):
+        weighted = jacobian[axis] * weight[axis].astype(np.float32) ** 2
+        matrix += weighted @ jacobian[axis].T
+        right += weighted @ off_rad[axis]
+    moved = np.linalg.solve(matrix, right)
+    return moved, off_rad - moved @ jacobian

@@ -1,0 +1,176 @@
+"""What a frame of crossed fringes must show: phases predicted from the surface, light predicted from the reference.
+
+A bin shows I = A + B_x cos(phi_x + d_x) + B_y cos(phi_y + d_y) + harmonics. Its phases are those of the screen points
+that the surface sends its ray to, traced exactly, plus what the reference saw beyond its own fit: averaging over the
+bin, and shape that 36 terms cannot represent. Light and response of the panel are the reference's.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology import bins, full, phase, reconstruct
+from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+
+# A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
+_BIN_RAD = 1.6
+_BINS_PX = (16, 8, 4, 2, 1)
+_ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
+_STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
+_HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
+_RESPONSE_POWERS = (2, 3, 4, 5)
+
+
+@dataclass(frozen=True)
+class CrossedScene:
+    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius."""
+
+    tracer: reconstruct.Tracer  # the bench with the vertex of the reference
+    surface: surface.Surface  # of the reference
+    bin_px: int
+    index: IntArray  # (n,): bins, counted row by row
+    points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
+    beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
+    light_adu: FloatArray  # (3, n): mean level and swings of x and y
+    basis: Singles  # (36, n): Noll terms at the bins, for what changes smoothly
+    position_mm: FloatArray  # (2, n): on the mirror
+    # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5; zeros if straight
+    response: FloatArray
+    rad_per_mm: float
+    half_side_mm: float  # of the pattern
+
+    def phase_rad(self, shape: surface.Surface) -> FloatArray:
+        """Phases (2, n) of x and y that a surface shows, counted from the low edge's -pi.
+
+        The ring does not move: a deeper bowl has its vertex lower.
+        """
+        lower_mm = shape.sag_mm - self.surface.sag_mm
+        bench = reconstruct.Tracer(self.tracer.geometry, shape.radius_mm, self.tracer.vertex_z_mm - lower_mm)
+        bench.intersect(self.points, shape, newton=2)
+        seen = bench.predict_screen(self.points, shape) + self.beyond_mm
+        return (seen + self.half_side_mm) * self.rad_per_mm - math.pi
+
+    def jacobian(self, shape: surface.Surface) -> Singles:
+        """Change (2, 36, n) of the phases per mm of each parameter of the surface."""
+        out = np.empty((2, surface.PARAMETERS, self.index.size), np.float32)
+        for k, step in enumerate(np.eye(surface.PARAMETERS) * _STEP_MM):
+            above, below = (
+                self.phase_rad(surface.Surface.from_parameters(shape.parameters + sign * step, shape.radius_mm))
+                for sign in (1, -1)
+            )
+            out[:, k] = (above - below) / (2 * _STEP_MM)
+        return out
+
+    def harmonics_adu(self, phase_rad: FloatArray) -> FloatArray:
+        """Light (n,) at phases (2, n) beyond level and swings, by the panel's response."""
+        v = 0.5 + 0.25 * np.cos(phase_rad).sum(axis=0)
+        bent = self.response @ np.stack([v**k - v for k in _RESPONSE_POWERS])
+        return np.asarray(2 * self.light_adu[1:].sum(axis=0) * bent)
+
+    def with_light(self, light_adu: FloatArray, beyond_mm: FloatArray) -> "CrossedScene":
+        """The same with light and shape as five steps of the crossed pattern saw them."""
+        return replace(self, light_adu=light_adu, beyond_mm=beyond_mm)
+
+
+def scene_of(
+    optics: OpticsConfig, checked: Checked, figure: full.BinFigure, period_mm: float, contrast: float = 1.0
+) -> CrossedScene:
+    """The scene of a reference set for a crossed pattern on the same region.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        Of the reference.
+    checked, figure : Checked, BinFigure
+        The reference, and the surface through its bins.
+    period_mm : float
+        Of the crossed fringes.
+    contrast : float
+        Of the pattern, c in docs/interfaces.md.
+
+    Raises ValueError if the camera cannot resolve such fringes.
+    """
+    camera, fine_px = optics.camera, checked.binned.bin_px
+    tracer, shape = checked.tracer, figure.fit.surface
+    rad_per_mm = 2 * math.pi / period_mm
+    traced = tracer.predict_screen(figure.points, shape)
+    bin_px = _bin_px(checked, figure, traced * rad_per_mm)
+    fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
+    fine.reshape(5, -1)[:2, figure.index] = figure.points.screen_mm - traced
+    fine[2] = checked.view.light
+    fine[3:] = contrast * checked.view.swing_adu.mean(axis=0) / 2  # each axis has half of the panel's range
+    coarse = _coarser(fine, bin_px // fine_px)
+    rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
+    coarse = coarse[:, :rows, :columns].reshape(5, -1)
+    index = np.flatnonzero(np.isfinite(coarse).all(axis=0))
+    grid = bins.BinGrid(tracer.geometry, camera, bin_px)
+    points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
+    tracer.start(points, shape.height)
+    bias = grid.averaging_bias_mm(tracer, points, shape, index)
+    position = tracer.position_mm(points)
+    return CrossedScene(
+        tracer=tracer,
+        surface=shape,
+        bin_px=bin_px,
+        index=index,
+        points=points,
+        beyond_mm=coarse[:2, index] + bias,
+        light_adu=coarse[2:, index].copy(),
+        basis=zernike.values(*position / shape.radius_mm).astype(np.float32),
+        position_mm=position,
+        response=_response(checked, figure, traced, phase.mm_per_rad(optics.pattern), optics),
+        rad_per_mm=rad_per_mm,
+        half_side_mm=optics.pattern.periods * optics.pattern.period_mm / 2,
+    )
+
+
+def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> int:
+    """The largest bins, made of whole ones of the reference, over which the fringes hardly average out."""
+    fine_px = checked.binned.bin_px
+    shape = checked.binned.means.shape[1:]
+    change = np.full((2, *shape), np.nan)
+    change.reshape(2, -1)[:, figure.index] = phase_rad
+    along = [np.abs(np.diff(change, axis=axis)) for axis in (1, 2)]
+    per_px = max(float(np.nanquantile(a, 0.95)) for a in along) / fine_px
+    for side in _BINS_PX:
+        if side % fine_px == 0 and side * per_px <= _BIN_RAD and figure.index.size * (fine_px / side) ** 2 > _ENOUGH_BINS:
+            return side
+    if fine_px * per_px > _BIN_RAD:
+        raise ValueError(f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period")
+    return fine_px
+
+
+def _coarser(fine: FloatArray, side: int) -> FloatArray:
+    """Means over squares of `side`; NaN unless all of a square is known."""
+    rows, columns = fine.shape[1] // side, fine.shape[2] // side
+    squares = fine[:, : rows * side, : columns * side].reshape(len(fine), rows, side, columns, side)
+    return np.asarray(squares.mean(axis=(2, 4)))
+
+
+def _response(
+    checked: Checked, figure: full.BinFigure, traced_mm: FloatArray, mm_per_rad: float, optics: OpticsConfig
+) -> FloatArray:
+    """The panel's response from the reference's sinusoids, between its black and its white frame."""
+    stack, index = checked.stack, figure.index
+    none = np.zeros(len(_RESPONSE_POWERS))
+    white, black = (stack.single(role) for role in ("white", "black"))
+    bad = {flag.frame for flag in checked.flags} | set(stack.unusable)
+    if white is None or black is None or {white, black} & bad:
+        return none
+    low, high = (checked.binned.means[k].reshape(-1)[index].astype(float) for k in (black, white))
+    shown, seen = [], []
+    for axis, used in enumerate(checked.view.used):
+        phases = traced_mm[axis] / mm_per_rad + phase.centre_phase_rad(optics.pattern)
+        for frame in used:
+            shown.append((1 + np.cos(phases + stack.patterns[frame].shift_rad)) / 2)
+            seen.append((checked.binned.means[frame].reshape(-1)[index] - low) / (high - low))
+    v, y = np.concatenate(shown), np.concatenate(seen)
+    columns = np.stack([v**k - v for k in _RESPONSE_POWERS])
+    solved = np.linalg.solve(columns @ columns.T, columns @ (y - v))
+    level = np.linspace(0, 1, 101)
+    deviation = solved @ np.stack([level**k - level for k in _RESPONSE_POWERS])
+    return solved if np.abs(deviation).max() > _HARMONIC else none
