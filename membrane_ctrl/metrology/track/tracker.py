@@ -99,7 +99,7 @@ class Tracker:
         self._light = self._anchor_light = math.nan
         self._seen: Singles = none
         self._covariance, self._covariance_age = np.full((36, 36), math.nan), 0
-        self._squares = Squares(scene)
+        self._squares = _Squares(scene)
         self._left, self._count = np.zeros(scene.index.size), 0
 
     def anchor(self, frames: list[Image], shifts_rad: FloatArray) -> bool:
@@ -229,8 +229,8 @@ class Tracker:
         return fit
 
     def _scale_of(self, fit: FrameFit) -> float:
-        """Robust sigma of the residual: the median of its size; not less than half of the pixels' noise."""
-        return max(1.4826 * float(np.median(np.abs(fit.residual_adu[::3]))), 0.5 * self._noise_adu)
+        """Robust sigma of the residual: the median of its size, unless rounding makes that less than the noise."""
+        return max(1.4826 * float(np.median(np.abs(fit.residual_adu[::3]))), self._noise_adu)
 
     def _lost(self, fit: FrameFit) -> bool:
         swing = float(np.median(self._fitter.scene.light_adu[1]))
@@ -309,12 +309,13 @@ def _rejected(time_s: float, reason: str, rest: float = math.nan) -> TrackedFram
     return TrackedFrame(time_s, none, none, math.nan, math.nan, math.nan, "rejected", reason, rest)
 
 
-class Squares:
+class _Squares:
     """The mirror in squares, each larger than a fringe, for the light of a frame."""
 
     def __init__(self, scene: CrossedScene) -> None:
         self._number = squares(scene.position_mm, scene.surface.radius_mm, 12)
         self._count = np.bincount(self._number)
+        self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
         self._level = self._means(scene.light_adu[0])
 
     def _means(self, values: FloatArray | Singles) -> FloatArray:
@@ -323,8 +324,8 @@ class Squares:
     def look(self, seen: Singles) -> tuple[float, BoolArray]:
         """Light of a frame over the scene's, and the squares whose light is wrong."""
         share = self._means(seen) / self._level
-        light = float(np.median(share))
-        return light, np.abs(share - light) > _COVERED * max(light, 1e-6)
+        light = float(np.median(share[self._whole]))
+        return light, self._whole & (np.abs(share - light) > _COVERED * max(light, 1e-6))
 
     def bins(self, chosen: BoolArray) -> BoolArray:
         """The bins (n,) of squares."""
