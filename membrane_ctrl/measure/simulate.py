@@ -48,7 +48,9 @@ def simulate_command(options: SimulateOptions) -> int:
         spec = specification(options)
         with errors.writing(options.folder):
             if options.track:
-                simulate.simulate_track(options.folder, spec, options.track, options.rate_hz, _progress(options.track))
+                simulate.simulate_track(
+                    options.folder, spec, options.track, options.rate_hz, _progress(options.track)
+                )
             elif options.sets == 1:
                 simulate.simulate_set(options.folder, spec)
             else:

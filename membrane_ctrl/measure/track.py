@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -123,26 +123,29 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
     size = (optics.camera.height_px, optics.camera.width_px)
-    tracker = Tracker(
-        scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um
-    )
+    tracker = Tracker(scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um)
     shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
     pictures = _pictures(content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16))
-    first: list[Image | str] = []
-    stepped = len(shifts) >= ENOUGH_STEPS and separable(shifts[: ENOUGH_STEPS])
-    if stepped:
-        first = [next(pictures) for _ in range(ENOUGH_STEPS)]
-        good = [picture for picture in first if not isinstance(picture, str)]
-        stepped = len(good) == ENOUGH_STEPS and tracker.anchor(good, shifts[: ENOUGH_STEPS])
-    found = []
-    rows = zip(content.frames, chain(first, pictures), strict=True)
-    for row, picture in terminal.counted(rows, "frames", len(content.frames)):
-        reading = math.nan if row.displacement_um is None else row.displacement_um
+    times = np.array([row.time_s for row in content.frames])
+    readings = np.array([math.nan if row.displacement_um is None else row.displacement_um for row in content.frames])
+    found: list[TrackedFrame] = []
+    first = list(islice(pictures, ENOUGH_STEPS if separable(shifts[:ENOUGH_STEPS]) else 0))
+    good = [picture for picture in first if not isinstance(picture, str)]
+    if stepped := bool(good) and len(good) == len(first):
+        part = slice(0, ENOUGH_STEPS)
+        found, first = tracker.anchor(good, shifts[part], times[part], readings[part]), []
+    rest = terminal.counted(chain(first, pictures), "frames", len(times) - len(found))
+    for k, picture in enumerate(rest, start=len(found)):
+        at_s, reading = float(times[k]), float(readings[k])
         if isinstance(picture, str):
-            found.append(tracker.missed(row.time_s, picture))
+            found.append(tracker.missed(at_s, picture))
         else:
-            found.append(tracker.follow(picture, (row.shift_x_rad, row.shift_y_rad), row.time_s, reading))
-    return Track(tuple(found), stepped, tracker.mean_residual_adu())
+            found.append(tracker.follow(picture, (shifts[k, 0], shifts[k, 1]), at_s, reading))
+    return Track(
+        tuple(found),
+        stepped and not any(f.verdict == "rejected" for f in found[:ENOUGH_STEPS]),
+        tracker.mean_residual_adu(),
+    )
 
 
 def read_track(folder: Path) -> TrackFile:
@@ -187,9 +190,7 @@ def _require_reference(content: TrackFile, reference: SetFigure, path: Path) -> 
         )
 
 
-def _pictures(
-    content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]
-) -> Iterator[Image | str]:
+def _pictures(content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]) -> Iterator[Image | str]:
     """The frames one after the other; a text where there is none. Raises InputError for another size or depth."""
     for row in content.frames:
         picture = read_image(folder / row.file)
@@ -199,7 +200,9 @@ def _pictures(
                 seen = f"{picture.shape[1]} x {picture.shape[0]} pixels"
                 raise errors.InputError(f"{where} {seen}, the reference {size[1]} x {size[0]}")
             if picture.dtype != depth:
-                raise errors.InputError(f"{where} {8 * picture.itemsize} bit pixels, the reference {8 * depth.itemsize}")
+                raise errors.InputError(
+                    f"{where} {8 * picture.itemsize} bit pixels, the reference {8 * depth.itemsize}"
+                )
         yield picture
 
 

@@ -1,8 +1,9 @@
 """The fit of one frame: Gauss-Newton on the light of its bins, for the surface and for what changes smoothly.
 
 With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
-W Tukey's weights and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is kept from step to step and frame to
-frame: where J^T W r vanishes is the solution whatever matrix led there. It is made anew where steps shrink too slowly.
+W Tukey's weights and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is kept from step to step and from
+frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It is made anew where steps shrink
+too slowly.
 
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
@@ -20,10 +21,12 @@ from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.metrology.track.scene import CrossedScene
-from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
-_MAX_STEPS = 15
+_MAX_STEPS = 10
+_MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
+_ASTRAY_MM = 2.0  # a step beyond which nothing is linear
 _LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivatives: nanometres off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 # Tukey's weight reaches 0 here: noise keeps its weight, dust and glints have none
@@ -116,20 +119,22 @@ class FrameFitter:
         reach_adu : (n,) array
             Residual from which a bin has no weight; 0 leaves it out.
         """
-        shape, light, last = start.surface, start.light.copy(), math.inf
+        shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)
-            if self._inverse is None:
+            if self._inverse is None and matrices < _MAX_MATRICES:
                 self._inverse = self._inverted(shifts_rad, shape)
-            delta = self._inverse @ self._right()
+                matrices += 1
+            if self._inverse is None:
+                break
+            delta, last = self._inverse @ self._right(), change
             shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
             light += delta[PARAMETERS:].reshape(3, TERMS)
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
-            if not change > TOLERANCE_MM:
+            if not TOLERANCE_MM < change < _ASTRAY_MM:
                 break
             if change > _SLOW * last:
                 self._inverse = None
-            last = change
         residual, weights = self._out[5].copy(), self._out[6].copy()
         return FrameFit(shape, light, residual, weights, change <= TOLERANCE_MM)
 
@@ -169,47 +174,41 @@ class FrameFitter:
             out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self._basis * wave
         return out
 
-    def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray:
-        """(J^T W J)^-1. Raises ValueError if the bins do not determine the unknowns."""
+    def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray | None:
+        """(J^T W J)^-1; None if the bins do not determine the unknowns."""
         columns = self._columns(shifts_rad, shape)
         matrix = ((columns * self._out[6]) @ columns.T).astype(float)
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not kernels.invert(matrix):
-            raise ValueError("the frame does not determine the surface: too little of the mirror shows fringes")
-        return matrix * np.outer(scale, scale)
+            return None
+        return np.asarray(matrix * np.outer(scale, scale))
 
-    def covariance_mm2(
-        self, fit: FrameFit, shifts_rad: tuple[float, float], noise_adu: float
-    ) -> FloatArray:
+    def covariance_mm2(self, fit: FrameFit, shifts_rad: tuple[float, float], noise_adu: float) -> FloatArray:
         """Covariance (36, 36) of the parameters from what the fit leaves, or from the noise where that is larger.
 
         Errors of neighbouring bins belong together (light that wanders): what a square of 1.6 fringes contributes to
         the solution counts as one error, and the squares as independent. Maps of light are refitted with the surface,
         so that their errors are in it.
         """
-        columns = self._columns(shifts_rad, fit.surface)
-        pull = ((self._inverse_now(shifts_rad, fit)[:PARAMETERS].astype(np.float32) @ columns) * (
-            fit.weights * fit.residual_adu
-        )).astype(float)
+        if self._inverse is None:
+            return np.full((PARAMETERS, PARAMETERS), math.nan)
+        gain = self._inverse[:PARAMETERS]
+        pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface)
+        pull *= fit.weights * fit.residual_adu
         blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
-        count = int(blocks.max()) + 1
-        sums = np.stack([np.bincount(blocks, row, count) for row in pull])
+        sums = np.stack([np.bincount(blocks, row) for row in pull])
         used = np.count_nonzero(np.any(sums != 0, axis=0))
         seen = sums @ sums.T * used / max(used - PARAMETERS, 1)
-        of_noise = noise_adu**2 * self._inverse_now(shifts_rad, fit)[:PARAMETERS, :PARAMETERS]
-        grown = np.sqrt(np.maximum(np.diag(seen), np.diag(of_noise)) / np.diag(seen))
+        grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
-
-    def _inverse_now(self, shifts_rad: tuple[float, float], fit: FrameFit) -> FloatArray:
-        if self._inverse is None:
-            self._inverse = self._inverted(shifts_rad, fit.surface)
-        return self._inverse
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
         matrix = sum(j.astype(float) @ j.T for j in self.jacobian)
-        return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian])
+        return np.stack(
+            [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
+        )
 
 
 def squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
@@ -232,8 +231,8 @@ def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
 
 def stepped(
     fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
-) -> tuple[CrossedScene, Surface]:
-    """The scene as the steps saw it, and the surface that belongs to it.
+) -> tuple[CrossedScene, FloatArray]:
+    """The scene as the steps saw it, and by how much that moves the surface's parameters (36,).
 
     `fits` are those of the N single frames, `seen_adu` (N, n) their bins, `shifts_rad` (N, 2) their steps.
     """
@@ -251,12 +250,9 @@ def stepped(
     off_rad = np.arctan2(solved[:, 2::2], solved[:, 1::2]).T
     good = (np.abs(off_rad) < _FAR_RAD).all(axis=0) & (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
     moved, left_rad = _split(fitter, off_rad, swing * good)
-    middle = np.mean([fit.surface.parameters for fit in fits], axis=0)
     light = np.stack([solved[:, 0], *swing])
-    return (
-        scene.with_light(np.where(good, light, scene.light_adu), scene.beyond_mm + good * left_rad / scene.rad_per_mm),
-        Surface.from_parameters(middle + moved, scene.surface.radius_mm),
-    )
+    light = np.where(good, light, scene.light_adu)
+    return scene.with_light(light, scene.beyond_mm + good * left_rad / scene.rad_per_mm), moved
 
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -137,7 +137,11 @@ def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> 
     along = [np.abs(np.diff(change, axis=axis)) for axis in (1, 2)]
     per_px = max(float(np.nanquantile(a, 0.95)) for a in along) / fine_px
     for side in _BINS_PX:
-        if side % fine_px == 0 and side * per_px <= _BIN_RAD and figure.index.size * (fine_px / side) ** 2 > _ENOUGH_BINS:
+        if (
+            side % fine_px == 0
+            and side * per_px <= _BIN_RAD
+            and figure.index.size * (fine_px / side) ** 2 > _ENOUGH_BINS
+        ):
             return side
     if fine_px * per_px > _BIN_RAD:
         raise ValueError(f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period")

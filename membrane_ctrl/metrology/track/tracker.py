@@ -5,6 +5,7 @@ either: rays meet the screen at other distances, so that some micrometres of ast
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ _DIMMED = 0.9  # of the light at the anchor
 # What the fit leaves, over the swing of the fringes: noise, light and dust leave hundredths, a lost order 0.7
 _REST_REJECTED = 0.15
 _OUT_REJECTED = 0.1  # share of bins without weight
+_OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
@@ -102,33 +104,38 @@ class Tracker:
         self._squares = _Squares(scene)
         self._left, self._count = np.zeros(scene.index.size), 0
 
-    def anchor(self, frames: list[Image], shifts_rad: FloatArray) -> bool:
+    def anchor(
+        self, frames: Sequence[Image], shifts_rad: FloatArray, time_s: FloatArray, displacement_um: FloatArray
+    ) -> list[TrackedFrame]:
         """Take light, swings and phases of each bin from steps of the pattern.
 
         Parameters
         ----------
-        frames : list of five or more frames
+        frames : five or more frames
             Of a film that moves little.
         shifts_rad : (frames, 2) array
             Their phase steps of x and y.
+        time_s, displacement_um : (frames,) arrays
+            As in `follow`.
 
         Returns
         -------
-        bool
-            Whether all of the frames could be followed; nothing has changed otherwise.
+        list of TrackedFrame
+            Their figures; if one of them is rejected, the light remains that of the reference.
         """
-        before = dict(vars(self))
-        fits, seen = [], []
-        for frame, (x, y) in zip(frames, shifts_rad, strict=True):
-            followed = self.follow(frame, (float(x), float(y)), math.nan)
-            if followed.verdict == "rejected":
-                vars(self).update(before)
-                return False
+        found, fits, seen = [], [], []
+        for frame, (x, y), at_s, reading in zip(frames, shifts_rad, time_s, displacement_um, strict=True):
+            found.append(self.follow(frame, (float(x), float(y)), float(at_s), float(reading)))
             fits.append(self._last)
             seen.append(self._seen)
-        scene, shape = stepped(self._fitter, fits, np.stack(seen), shifts_rad)
-        self._begin(scene, shape)
-        return True
+        if any(frame.verdict == "rejected" for frame in found):
+            return found
+        scene, moved = stepped(self._fitter, fits, np.stack(seen), shifts_rad)
+        known = self._last_time_s, self._last_displacement_um
+        parameters = np.mean([fit.surface.parameters for fit in fits], axis=0) + moved
+        self._begin(scene, surface.Surface.from_parameters(parameters, scene.surface.radius_mm))
+        self._last_time_s, self._last_displacement_um = known
+        return [_moved(frame, moved, scene.surface.radius_mm) for frame in found]
 
     def follow(
         self, frame: Image, shifts_rad: tuple[float, float], time_s: float, displacement_um: float = math.nan
@@ -216,16 +223,18 @@ class Tracker:
     def _robust(
         self, seen: Singles, shifts_rad: tuple[float, float], start: FrameFit, left_out: BoolArray
     ) -> FrameFit:
-        """Fit with Tukey's weights of the residual's own scale."""
-        scale = self._scale_adu or _FIRST_REACH
-        for _ in range(4):
-            reach = np.where(left_out, 0.0, _REACH_SIGMAS * scale)
-            fit = self._fitter.fit(seen, shifts_rad, start, reach)
-            found = self._scale_of(fit)
-            if 0.67 * scale < found < 1.5 * scale:
+        """Fit with Tukey's weights, at first of the last frame's scale: a film that moved needs all bins to begin."""
+        fit = start
+        for first in filter(None, (self._scale_adu, _FIRST_REACH)):
+            fit, scale = start, first
+            for _ in range(4):
+                fit = self._fitter.fit(seen, shifts_rad, fit, np.where(left_out, 0.0, _REACH_SIGMAS * scale))
+                found = self._scale_of(fit)
+                if 0.67 * scale < found < 1.5 * scale or self._lost(fit):
+                    break
+                scale = found
+            if fit.converged and np.mean(fit.weights[~left_out] == 0) < _OUT_USUAL:
                 break
-            scale = found
-            start = fit if fit.converged else start
         return fit
 
     def _scale_of(self, fit: FrameFit) -> float:
@@ -236,9 +245,7 @@ class Tracker:
         swing = float(np.median(self._fitter.scene.light_adu[1]))
         return not fit.converged or self._scale_of(fit) > _REST_REJECTED * swing
 
-    def _doubt(
-        self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float
-    ) -> _Fault | None:
+    def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> _Fault | None:
         """Whether the solution is the next one of this mirror."""
         if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
@@ -258,7 +265,9 @@ class Tracker:
         tilt_um = float(np.hypot(*change_um[:2]))
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
-            self._knocked = f"knocked: the figure tilted by {urad:.0f} urad at {time_s:.2f} s; check camera and screen"
+            self._knocked = (
+                f"knocked: the figure tilted by {urad:.0f} urad at {time_s:.2f} s; check camera and screen"
+            )
         return _Fault("degraded", self._knocked) if self._knocked else None
 
     def _accept(self, fit: FrameFit, light: float, time_s: float, displacement_um: float) -> None:
@@ -295,13 +304,32 @@ def _light_faults(saturated: float, light: float, covered: BoolArray) -> list[_F
     """What the picture's light says before any fit."""
     share = float(np.mean(covered))
     checks = (
-        (saturated > shape_estimate.SATURATED_REJECTED_FRACTION, "rejected", f"{saturated:.0%} of the bins saturated"),
+        (
+            saturated > shape_estimate.SATURATED_REJECTED_FRACTION,
+            "rejected",
+            f"saturated: {saturated:.0%} of the bins",
+        ),
         (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
         (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
-        (saturated > shape_estimate.SATURATED_DEGRADED_FRACTION, "degraded", f"{saturated:.1%} of the bins saturated"),
+        (
+            saturated > shape_estimate.SATURATED_DEGRADED_FRACTION,
+            "degraded",
+            f"saturated: {saturated:.1%} of the bins",
+        ),
         (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
     )
     return [_Fault(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
+
+
+def _moved(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
+    """The frame with a change of the surface's parameters."""
+    change = surface.Surface.from_parameters(by_mm, radius_mm)
+    return replace(
+        frame,
+        coeffs_um=frame.coeffs_um + 1e3 * change.coeffs_mm,
+        hencky_um=frame.hencky_um + 1e3 * change.hencky_mm,
+        sag_um=frame.sag_um + 1e3 * change.sag_mm,
+    )
 
 
 def _rejected(time_s: float, reason: str, rest: float = math.nan) -> TrackedFrame:

@@ -92,7 +92,9 @@ class OpticsRenderer:
             self.film.radius_mm,
             config.periods * config.period_mm,
             (table.values, table.cell_mm, table.smooth),
-            np.array([dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full, self.light.gamma]),
+            np.array(
+                [dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full, self.light.gamma]
+            ),
             self._loss,
             (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
             picture,

@@ -176,11 +176,11 @@ def simulate_track(
     rate_hz: float = 20.0,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; one clock and one motion for both.
+    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock and motion.
 
     The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`, `sag_um` (frames,)
-    and, if 36 terms represent the film, `coeffs_um` (frames, 36). `on_frame` gets the number of frames written. Raises
-    ValueError as `simulate_run`, and for a rate that is no number.
+    and, if 36 terms represent the film, `coeffs_um` (frames, 36). `on_frame` gets the number of frames written.
+    Raises ValueError for frames or a rate that are not above 0, and for a specification that is not of a full set.
     """
     if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:
         raise ValueError("track: one frame or more, at a rate above 0, of a film that moves by motion")

@@ -1,0 +1,168 @@
+"""Tracking a crossed pattern: what a frame gives, and which frames are refused by name."""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
+from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
+from membrane_ctrl.sim.optics.simulate import simulate_set
+from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
+
+Frames = list[NDArray[np.uint8]]
+SHRINK = 10
+SIZE = (2048 // SHRINK, 2448 // SHRINK)
+OPTICS = OpticsConfig(camera=CameraConfig(width_px=SIZE[1], height_px=SIZE[0], pixel_um=3.45 * SHRINK))
+FILM = typical_film(37.1, 500.0, seed=1)
+STEPS = np.array([(2 * math.pi * k / 5, 4 * math.pi * k / 5) for k in range(5)])
+STILL = (0.0, 0.0)
+LOST_TILT_UM = 548.3  # of this bench: it moves the reflected pattern by one period along x
+
+
+@dataclass
+class Bench:
+    """A reference, and the frames that the twin's camera takes of a crossed pattern."""
+
+    scene: CrossedScene
+    prepared: Tracker
+    taken: int = 0
+
+    def frame(
+        self, moved_um: float = 0.0, film: FilmShape = FILM, gain: float = 1.0, shifts: tuple[float, float] = STILL
+    ) -> NDArray[np.uint8]:
+        self.taken += 1
+        renderer = OpticsRenderer(OPTICS, film, seed=100 + self.taken)
+        return np.asarray(renderer.render(Pattern("crossed", "", 32, *shifts), moved_um, gain=gain), np.uint8)
+
+    def tracker(self) -> Tracker:
+        """A tracker that has seen nothing, or only the still mirror; its derivatives are made once."""
+        return copy(self.prepared)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    folder = tmp_path_factory.mktemp("track") / "full"
+    simulate_set(folder, SimulationSpec(OPTICS, FILM))
+    reference = Figures().of(folder)
+    scene = scene_of(reference.head.optics, reference.checked, reference.figure, 12.455)
+    return Bench(scene, Tracker(scene, SIZE, 255, OPTICS.camera.noise_adu))
+
+
+def with_terms(by_um: dict[int, float]) -> FilmShape:
+    terms = np.zeros(36)
+    terms[: len(FILM.zernike_um)] = FILM.zernike_um
+    for j, um in by_um.items():
+        terms[j - 1] += um
+    return replace(FILM, zernike_um=tuple(terms))
+
+
+def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None:
+    tracker = bench.tracker()
+    stepped = [bench.frame(shifts=(float(x), float(y))) for x, y in STEPS]
+    begun = tracker.anchor(stepped, STEPS, 0.1 * np.arange(-5, 0), np.full(5, math.nan))
+    assert [frame.verdict for frame in begun] == ["ok"] * 5
+    moved = [0.0, 1.0, 3.0, 3.2, 40.0, -60.0]
+    frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate(moved)]
+    assert [frame.verdict for frame in frames] == ["ok"] * len(moved), frames
+    truth = np.array([FILM.sag_at_mm(um) for um in moved]) * 1e3
+    error = np.array([frame.sag_um for frame in frames]) - truth
+    sigma = frames[0].sag_sigma_um
+    assert 0.005 < sigma < 0.05
+    assert np.abs(error - error.mean()).max() < 4 * sigma  # the anchor's own error is common
+    change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 um has only m = 0
+    odd = [j for j in range(2, 37) if noll_orders(j)[1] != 0]
+    assert (np.abs(change_um / frames[0].sigma_um)[[j - 1 for j in odd]] < 5 * math.sqrt(2)).all()
+
+
+def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
+    tracker = bench.tracker()
+    frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))]
+    assert [frame.verdict for frame in frames] == ["ok", "ok"]
+    assert frames[1].sag_um - frames[0].sag_um == pytest.approx(5.0, abs=0.15)
+
+
+def hand(frame: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
+    out = frame.copy()
+    out[60:140, 60 : 60 + columns] = 9
+    return out
+
+
+def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
+    """The result of a faulty frame between good ones, and of the good one after it."""
+    tracker = bench.tracker()
+    good = bench.frame()
+    assert tracker.follow(good, STILL, 0.0).verdict == "ok"
+    faulty = {
+        "frozen": lambda: good,
+        "hand": lambda: hand(bench.frame(), 40),
+        "body": lambda: hand(bench.frame(), 100),
+        "dark": lambda: bench.frame(gain=0.1),
+        "bright": lambda: bench.frame(gain=2.5),
+        "exposure": lambda: bench.frame(gain=0.85),
+        "jump": lambda: bench.frame(700.0),
+        "tilt by a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM})),
+        "tilt by half a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM / 2})),
+        "knock": lambda: bench.frame(film=with_terms({3: 20.0})),
+        "other": lambda: np.full(SIZE, 120, np.uint8),
+    }
+    return tracker.follow(faulty[name](), STILL, 0.05), tracker.follow(bench.frame(2.0), STILL, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict", "reason"),
+    [
+        ("frozen", "rejected", "frozen"),
+        ("hand", "degraded", "covered"),
+        ("body", "rejected", "covered"),
+        ("dark", "rejected", "dark"),
+        ("bright", "rejected", "saturated"),
+        ("exposure", "degraded", "exposure changed"),
+        ("jump", "rejected", "order lost"),
+        ("tilt by a period", "rejected", "order lost"),
+        ("tilt by half a period", "rejected", "order lost"),
+        ("knock", "degraded", "knocked"),
+        ("other", "rejected", ""),
+    ],
+)
+def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, verdict: str, reason: str) -> None:
+    faulty, after = judged(bench, name)
+    assert (faulty.verdict, faulty.reason[: len(reason)]) == (verdict, reason), faulty.reason
+    assert np.isnan(faulty.sag_um) == (verdict == "rejected")
+    named = {"exposure": "exposure changed", "knock": "knocked"}.get(name, "")  # light returns; a knock remains
+    assert (after.verdict, after.reason[: len(named)]) == ("degraded" if named else "ok", named), after.reason
+    assert after.sag_um - 1e3 * bench.scene.surface.sag_mm == pytest.approx(2.0, abs=0.2)
+
+
+def jumps(bench: Bench, count: int, seed: int) -> list[str]:
+    """Random jumps of sag and tilt, each from the still mirror, whose frames were wrong and not refused."""
+    generator, silent, good = np.random.default_rng(seed), [], bench.tracker()
+    assert good.follow(bench.frame(), STILL, 0.0).verdict == "ok"
+    for _ in range(count):
+        sag_um, tilt_mrad, angle = generator.uniform((0, 0, 0), (1000, 10, 2 * math.pi))
+        tilt_um = 250.0 * tilt_mrad  # RMS
+        film = with_terms({2: tilt_um * math.cos(angle), 3: tilt_um * math.sin(angle)})
+        found = copy(good).follow(bench.frame(sag_um, film), STILL, 0.05)
+        error_um = found.sag_um - 1e3 * bench.scene.surface.sag_mm - sag_um
+        if found.verdict != "rejected" and not abs(error_um) < 1.0:
+            silent.append(f"{sag_um:.0f} um, {tilt_mrad:.2f} mrad: {found.verdict}, {error_um:.2f} um off")
+    return silent
+
+
+def test_jumps_lose_no_order_silently(bench: Bench) -> None:
+    assert jumps(bench, 20, seed=5) == []
+
+
+@pytest.mark.campaign
+def test_a_thousand_jumps_lose_no_order_silently(bench: Bench) -> None:
+    assert jumps(bench, 1000, seed=6) == []
