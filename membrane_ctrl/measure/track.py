@@ -228,6 +228,7 @@ def _table(track: Track) -> dict[str, Any]:
         "sag_mean_um": float(sag.mean()) if used else None,
         "sag_sd_um": float(sag.std()) if used else None,
         "sag_sigma_um": float(np.median(sigma)) if used else None,
+        "rest_share": float(np.median([frame.rest_share for frame in used])) if used else None,
         "reasons": dict(reasons.most_common()),
     }
 
@@ -244,6 +245,7 @@ def _lines(table: dict[str, Any]) -> list[str]:
             f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation {table['sag_sd_um']:.3f} um, "
             f"1 sigma of a frame {table['sag_sigma_um']:.3f} um"
         )
+        lines.append(f"fit       leaves {table['rest_share']:.2%} of the fringes' swing")
     return lines
 
 

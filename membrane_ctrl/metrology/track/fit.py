@@ -98,9 +98,9 @@ class FrameFitter:
     def __init__(self, scene: CrossedScene) -> None:
         self.scene = scene
         self.jacobian = scene.jacobian(scene.surface)
-        self._basis = scene.basis
+        self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
-        self._base = scene.phase_rad(scene.surface)
+        self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((7, scene.index.size), np.float32)
         self._maps = np.empty((3, scene.index.size), np.float32)
@@ -144,14 +144,15 @@ class FrameFitter:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
-            self._traced, self._base, moved = shape, self.scene.phase_rad(shape), np.zeros(PARAMETERS)
+            self._traced, moved = shape, np.zeros(PARAMETERS)
+            self._base = _reduced(self.scene.phase_rad(shape))
         turn = moved.astype(np.float32) @ self.jacobian
-        np.matmul(light.astype(np.float32), self._basis, out=self._maps)
+        np.matmul(light.astype(np.float32), self.scene.basis, out=self._maps)
         self._maps += 1
-        self._maps *= self.scene.light_adu
+        self._maps *= self._light_adu
 
         def run(start: int, stop: int) -> None:
-            fixed = (self._base, turn, np.array(shifts_rad), self._maps, self.scene.response)
+            fixed = (self._base, turn, np.array(shifts_rad, np.float32), self._maps, self.scene.response)
             _model(*fixed, seen_adu, reach, self._out, start, stop)
 
         split(run, self.scene.index.size)
@@ -159,19 +160,19 @@ class FrameFitter:
     def _right(self) -> FloatArray:
         """J^T W r (144,) of the last evaluation."""
         of_surface = self.jacobian[0] @ self._out[0] + self.jacobian[1] @ self._out[1]
-        of_light = (self._out[2:5] * self.scene.light_adu) @ self._basis.T
+        of_light = (self._out[2:5] * self._light_adu) @ self.scene.basis.T
         return np.concatenate([of_surface, of_light.ravel()]).astype(float)
 
     def _columns(self, shifts_rad: tuple[float, float], shape: Surface) -> Singles:
         """J (144, n) for a straight panel."""
         moved = (shape.parameters - self._traced.parameters).astype(np.float32)
-        x, y = self._base + moved @ self.jacobian + np.reshape(shifts_rad, (2, 1))
+        x, y = self._base + moved @ self.jacobian + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         swing_x, swing_y = self._maps[1], self._maps[2]
-        level, first, second = self.scene.light_adu
+        level, first, second = self._light_adu
         out = np.empty((_UNKNOWNS, self.scene.index.size), np.float32)
         out[:PARAMETERS] = -swing_x * np.sin(x) * self.jacobian[0] - swing_y * np.sin(y) * self.jacobian[1]
         for k, wave in enumerate((level, first * np.cos(x), second * np.cos(y))):
-            out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self._basis * wave
+            out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self.scene.basis * wave
         return out
 
     def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray | None:
@@ -205,10 +206,15 @@ class FrameFitter:
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
-        matrix = sum(j.astype(float) @ j.T for j in self.jacobian)
+        matrix = np.sum([j.astype(float) @ j.T for j in self.jacobian], axis=0)
         return np.stack(
             [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
         )
+
+
+def _reduced(phase_rad: FloatArray) -> Singles:
+    """Phases within one turn, where single precision is worth 1e-7 rad."""
+    return np.asarray(np.remainder(phase_rad, 2 * math.pi), np.float32)
 
 
 def squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
@@ -263,5 +269,5 @@ def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tupl
         weighted = jacobian[axis] * weight[axis].astype(np.float32) ** 2
         matrix += weighted @ jacobian[axis].T
         right += weighted @ off_rad[axis]
-    moved = np.linalg.solve(matrix, right)
+    moved: FloatArray = np.linalg.solve(matrix, right)
     return moved, off_rad - moved @ jacobian

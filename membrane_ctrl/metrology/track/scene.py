@@ -18,6 +18,7 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
 _BIN_RAD = 1.6
+_PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
@@ -143,7 +144,7 @@ def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> 
             and figure.index.size * (fine_px / side) ** 2 > _ENOUGH_BINS
         ):
             return side
-    if fine_px * per_px > _BIN_RAD:
+    if per_px > _PIXEL_RAD:
         raise ValueError(f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period")
     return fine_px
 

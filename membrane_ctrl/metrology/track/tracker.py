@@ -32,7 +32,7 @@ _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
-_SIGMA_EVERY = 8  # frames: errors change slowly, and the covariance costs as much as two fits
+_SIGMA_EVERY = 25  # frames: errors change slowly, and the covariance costs as much as five fits
 
 
 @dataclass(frozen=True)

@@ -206,11 +206,11 @@ def simulate_track(
             on_frame(k + 1)
     pattern_mm = spec.optics.pattern
     crossed = {"periods": _CROSSED_PERIODS, "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS}
-    table = {"schema": "membrane-capture/1", "kind": "track", "reference": "../full"}
+    table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": "track", "reference": "../full"}
     table |= {"pattern": _written(pattern_mm) | {"crossed": crossed}, "frames": rows}
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
-    truth = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
+    truth: dict[str, Any] = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
     coeffs = [spec.film.coeffs_um(float(d)) for d in displacement_um]
     if coeffs[0] is not None:
         truth["coeffs_um"] = np.array(coeffs)
