@@ -199,14 +199,14 @@ class FrameFitter:
         pull *= fit.weights * fit.residual_adu
         blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
         sums = np.stack([np.bincount(blocks, row) for row in pull])
-        used = np.count_nonzero(np.any(sums != 0, axis=0))
-        seen = sums @ sums.T * used / max(used - PARAMETERS, 1)
+        used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
+        seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
-        matrix = np.sum([j.astype(float) @ j.T for j in self.jacobian], axis=0)
+        matrix: FloatArray = np.asarray([j.astype(float) @ j.T for j in self.jacobian]).sum(axis=0)
         return np.stack(
             [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
         )
@@ -269,5 +269,5 @@ def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tupl
         weighted = jacobian[axis] * weight[axis].astype(np.float32) ** 2
         matrix += weighted @ jacobian[axis].T
         right += weighted @ off_rad[axis]
-    moved: FloatArray = np.linalg.solve(matrix, right)
+    moved = np.asarray(np.linalg.solve(matrix, right), float)
     return moved, off_rad - moved @ jacobian

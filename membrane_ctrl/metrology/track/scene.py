@@ -13,7 +13,8 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, phase, reconstruct
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
@@ -31,7 +32,7 @@ class CrossedScene:
     """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius."""
 
     tracer: reconstruct.Tracer  # the bench with the vertex of the reference
-    surface: surface.Surface  # of the reference
+    surface: Surface  # of the reference
     bin_px: int
     index: IntArray  # (n,): bins, counted row by row
     points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
@@ -44,7 +45,7 @@ class CrossedScene:
     rad_per_mm: float
     half_side_mm: float  # of the pattern
 
-    def phase_rad(self, shape: surface.Surface) -> FloatArray:
+    def phase_rad(self, shape: Surface) -> FloatArray:
         """Phases (2, n) of x and y that a surface shows, counted from the low edge's -pi.
 
         The ring does not move: a deeper bowl has its vertex lower.
@@ -55,12 +56,12 @@ class CrossedScene:
         seen = bench.predict_screen(self.points, shape) + self.beyond_mm
         return (seen + self.half_side_mm) * self.rad_per_mm - math.pi
 
-    def jacobian(self, shape: surface.Surface) -> Singles:
+    def jacobian(self, shape: Surface) -> Singles:
         """Change (2, 36, n) of the phases per mm of each parameter of the surface."""
-        out = np.empty((2, surface.PARAMETERS, self.index.size), np.float32)
-        for k, step in enumerate(np.eye(surface.PARAMETERS) * _STEP_MM):
+        out = np.empty((2, PARAMETERS, self.index.size), np.float32)
+        for k, step in enumerate(np.eye(PARAMETERS) * _STEP_MM):
             above, below = (
-                self.phase_rad(surface.Surface.from_parameters(shape.parameters + sign * step, shape.radius_mm))
+                self.phase_rad(Surface.from_parameters(shape.parameters + sign * step, shape.radius_mm))
                 for sign in (1, -1)
             )
             out[:, k] = (above - below) / (2 * _STEP_MM)
