@@ -23,6 +23,7 @@ NAMES = (
     "hold_live",
     "ticks",
     "live_cycle",
+    "tracking",
     "measure_full",
     "monte_carlo",
     "acquisition",

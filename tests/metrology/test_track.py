@@ -114,7 +114,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "tilt by a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM})),
         "tilt by half a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM / 2})),
         "knock": lambda: bench.frame(film=with_terms({3: 20.0})),
-        "other": lambda: np.full(SIZE, 120, np.uint8),
+        "blank": lambda: np.full(SIZE, 120, np.uint8),
     }
     return tracker.follow(faulty[name](), STILL, 0.05), tracker.follow(bench.frame(2.0), STILL, 0.1)
 
@@ -132,7 +132,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("tilt by a period", "rejected", "order lost"),
         ("tilt by half a period", "rejected", "order lost"),
         ("knock", "degraded", "knocked"),
-        ("other", "rejected", ""),
+        ("blank", "rejected", "no fringes"),
     ],
 )
 def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, verdict: str, reason: str) -> None:

@@ -119,6 +119,19 @@ class FrameFitter:
         reach_adu : (n,) array
             Residual from which a bin has no weight; 0 leaves it out.
         """
+        inherited = self._inverse is not None
+        found = self._descend(seen_adu, shifts_rad, start, reach_adu)
+        if not found.converged and inherited:  # perhaps the matrix is of another frame
+            self._inverse = None
+            found = self._descend(seen_adu, shifts_rad, start, reach_adu)
+        if not found.converged:
+            self._inverse = None
+        return found
+
+    def _descend(
+        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
+    ) -> FrameFit:
+        """Take steps until they vanish, lead astray or need too many matrices."""
         shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)

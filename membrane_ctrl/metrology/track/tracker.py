@@ -21,6 +21,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 _COVERED = 0.25
 _COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
 _DARK = 0.3  # of the reference's light
+_CONTRAST = 0.4  # of the fringes, against the reference's
 _EXPOSURE = 0.03  # change of light from frame to frame that no panel makes
 _DIMMED = 0.9  # of the light at the anchor
 # What the fit leaves, over the swing of the fringes: noise, light and dust leave hundredths, a lost order 0.7
@@ -247,6 +248,9 @@ class Tracker:
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> _Fault | None:
         """Whether the solution is the next one of this mirror."""
+        contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
+        if fit.converged and contrast < _CONTRAST:
+            return _Fault("rejected", f"no fringes: {max(contrast, 0.0):.0%} of the reference's contrast")
         if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
             return _Fault("rejected", f"order lost: the mirror moved too far since the last good frame ({left})")
