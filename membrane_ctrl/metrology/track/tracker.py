@@ -248,12 +248,12 @@ class Tracker:
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> _Fault | None:
         """Whether the solution is the next one of this mirror."""
-        contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
-        if fit.converged and contrast < _CONTRAST:
-            return _Fault("rejected", f"no fringes: {max(contrast, 0.0):.0%} of the reference's contrast")
         if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
             return _Fault("rejected", f"order lost: the mirror moved too far since the last good frame ({left})")
+        contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
+        if contrast < _CONTRAST:
+            return _Fault("rejected", f"no fringes: {max(contrast, 0.0):.0%} of the reference's contrast")
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
