@@ -37,7 +37,7 @@ def run() -> list[Figure]:
     camera = OPTICS.camera
     tracker = Tracker(scene, (camera.height_px, camera.width_px), 255, camera.noise_adu)
     renderer = OpticsRenderer(OPTICS, FILM, seed=2)
-    shown = [Pattern("crossed", "", 32, float(x), float(y)) for x, y in STEPS]
+    shown = [Pattern("crossed", "", 32, float(x), shift_y_rad=float(y)) for x, y in STEPS]
     tracker.anchor([renderer.render(p, 0.0) for p in shown], STEPS, np.arange(5) / 20, np.full(5, math.nan))
     moved_um = 0.2 * np.sin(np.arange(FRAMES))
     frames = [renderer.render(shown[0], float(um)) for um in moved_um]

@@ -232,22 +232,16 @@ READS = {
 class Pattern:
     """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black".
 
-<<<<<<< HEAD
     `period_mm` is that of further sinusoids, which are coarser than the pattern's own (0).
-=======
     "crossed" shows sinusoids of x and y at once, `index` periods of each, with `shift_rad` and `shift_y_rad`.
->>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
     """
 
     role: str
     axis: str = ""
     index: int = 0
     shift_rad: float = 0.0
-<<<<<<< HEAD
     period_mm: float = 0.0
-=======
     shift_y_rad: float = 0.0
->>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
 
     @property
     def name(self) -> str:

@@ -32,12 +32,9 @@ class SimulateOptions:
     faults: tuple[str, ...]
     sets: int
     interval_s: float
-<<<<<<< HEAD
     coarser_mm: tuple[float, ...] = ()
-=======
     track: int = 0  # frames of a tracking set
     rate_hz: float = 20.0
->>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
 
 
 def simulate_command(options: SimulateOptions) -> int:

@@ -43,7 +43,10 @@ class Bench:
     ) -> NDArray[np.uint8]:
         self.taken += 1
         renderer = OpticsRenderer(OPTICS, film, seed=100 + self.taken)
-        return np.asarray(renderer.render(Pattern("crossed", "", 32, *shifts), moved_um, gain=gain), np.uint8)
+        return np.asarray(
+            renderer.render(Pattern("crossed", "", 32, shifts[0], shift_y_rad=shifts[1]), moved_um, gain=gain),
+            np.uint8,
+        )
 
     def tracker(self) -> Tracker:
         """A tracker that has seen nothing, or only the still mirror; its derivatives are made once."""

@@ -203,15 +203,12 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
     if pattern.role == "sin":
         levels = 0.5 + 0.5 * np.cos(phi + pattern.shift_rad)
-<<<<<<< HEAD
-        return LevelTable(_lit(levels, light), (pattern.period_mm or config.period_mm) / _SINE_CELLS, smooth=True)
-=======
-        return LevelTable(_lit(levels, light)[None], config.period_mm / _SINE_CELLS, smooth=True)
+        period_mm = pattern.period_mm or config.period_mm
+        return LevelTable(_lit(levels, light)[None], period_mm / _SINE_CELLS, smooth=True)
     if pattern.role == "crossed" and pattern.index > 0:
         both = np.stack([1.0 + np.cos(phi + shift) for shift in (pattern.shift_rad, pattern.shift_y_rad)])
         period_mm = config.periods * config.period_mm / pattern.index
         return LevelTable(both / 4.0, period_mm / _SINE_CELLS, smooth=True)
->>>>>>> 84b9e4c1 (Track: the figure of every frame of a crossed pattern; first path)
     half_periods = np.arange(2 * config.periods)
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
         codes = half_periods ^ (half_periods >> 1)

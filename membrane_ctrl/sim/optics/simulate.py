@@ -195,7 +195,7 @@ def simulate_track(
     rows = []
     for k in range(frames):
         shift_x, shift_y = (turns * 2 * np.pi * (k % _STEPS) / _STEPS if k < _STEPS else 0.0 for turns in (1, 2))
-        pattern = roles.Pattern("crossed", "", _CROSSED_PERIODS, shift_x, shift_y)
+        pattern = roles.Pattern("crossed", "", _CROSSED_PERIODS, shift_x, shift_y_rad=shift_y)
         row: dict[str, Any] = {"file": f"t_{k:05d}.png", "role": "crossed"}
         row |= {"shift_x_rad": shift_x, "shift_y_rad": shift_y, "time_s": round(float(time_s[k]), 9)}
         if spec.laser:
