@@ -252,8 +252,10 @@ class Tracker:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
             return _Fault("rejected", f"order lost: the mirror moved too far since the last good frame ({left})")
         contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
+        if contrast < -_CONTRAST:
+            return _Fault("rejected", "order lost: the fringes moved by half a period")
         if contrast < _CONTRAST:
-            return _Fault("rejected", f"no fringes: {max(contrast, 0.0):.0%} of the reference's contrast")
+            return _Fault("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
