@@ -121,7 +121,7 @@ def outer(options: TuneOptions) -> int:
         progress.begin("shape loop", shape_loop.TYPICAL_S + options.observe_s, options.verify_s)
         rig.hold(options.observe_s)
         steady = [shape for shape in rig.shapes if shape.verdict != "rejected"]
-        levels = shape_loop.step_experiment(rig, rig.loop.setpoint_um, folder.config.shape.enabled)
+        levels = shape_loop.step_experiment(rig)
         try:
             found = shape_loop.evaluate(levels, steady, assumed)
         except ValueError as error:

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -181,26 +182,20 @@ class HoldRig:
         trial_s: float = math.nan,
         shape_s: float = math.nan,
         pump: PumpConfig | None = None,
+        setpoint_step_um: float = math.nan,
     ) -> None:
         """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
 
-        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave them.
+        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave them. With
+        `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
         """
         told = Command("gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump)
-        self._link.ask(told)
+        self._link.ask(replace(told, setpoint_step_um=setpoint_step_um))
         self.loop, self.pump = loop, pump or self.pump
 
     def keep(self) -> None:
         """Keep the gains that are on trial."""
         self._link.ask(Command("keep", self._who, "verified"))
-
-    def setpoint(self, setpoint_um: float, why: str) -> None:
-        """Move the setpoint."""
-        self._link.ask(Command("setpoint", self._who, why, value=setpoint_um))
-
-    def shape_loop(self, on: bool, why: str) -> None:
-        """Switch the shape loop."""
-        self._link.ask(Command("shape_on" if on else "shape_off", self._who, why))
 
     def go_back(self) -> None:
         """End any running experiment and set the last good gains and curve."""

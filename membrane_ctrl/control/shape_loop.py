@@ -135,6 +135,11 @@ class ShapeLoop:
         self._seen_s = math.nan
         self._settled_since_s = math.inf
 
+    @property
+    def on(self) -> bool:
+        """Whether it is switched on."""
+        return self._state != states.ShapeState.OFF
+
     def set_memory(self, time_constant_s: float) -> None:
         """Set the tracker's memory; the trim does not jump."""
         self._drift.memory_s = time_constant_s

@@ -63,6 +63,7 @@ class Request(Section):
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
     experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
     shape_time_constant_s: float | None = None  # `gains`: of the shape loop
+    setpoint_step_um: Annotated[float, Field(ge=-30, le=30)] | None = None  # `gains`: of the setpoint, on trial
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
 
@@ -70,7 +71,7 @@ class Request(Section):
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         needs, takes = (rule.needs, rule.takes) if rule else ((), ())
-        for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s"):
+        for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s", "setpoint_step_um"):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
                 raise ValueError(f"{self.do} takes no {name}")

@@ -220,11 +220,13 @@ class Port:
             None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
         )
         pump = None if request.pump is None else toml_file.parse(request.pump, schema.PumpConfig, "gains: pump")
-        value, shape_s = (
-            math.nan if number is None else number for number in (request.value, request.shape_time_constant_s)
+        value, shape_s, step_um = (
+            math.nan if number is None else number
+            for number in (request.value, request.shape_time_constant_s, request.setpoint_step_um)
         )
         return commands.Command(
-            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s, pump
+            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s, pump,
+            step_um,
         )
 
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:

@@ -47,6 +47,7 @@ class Command:
     number: int = 0  # chosen by the client, returned with the answer
     shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
     pump: PumpConfig | None = None  # `gains`: the pump's curve, if it changes
+    setpoint_step_um: float = math.nan  # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ TABLE: dict[Kind, CommandRule] = {
         RUNNING,
         "Set gains, on trial or to stay.",
         needs=("loop",),
-        takes=("value", "shape_time_constant_s", "pump"),
+        takes=("value", "shape_time_constant_s", "pump", "setpoint_step_um"),
     ),
     "keep": CommandRule("tune", RUNNING, "Keep the gains on trial."),
     "tune": CommandRule("tune", _HOLD, "Run a tuning experiment.", needs=("experiment",)),
@@ -130,6 +131,8 @@ def refusal(command: Command, state: State, config: Config) -> str:
     memory_s = command.shape_time_constant_s
     if not (math.isnan(memory_s) or 1.0 <= memory_s <= MEMORY_MAX_S):
         return f"shape.time_constant_s = {memory_s:g} s is outside 1 .. {MEMORY_MAX_S:g} s"
+    if math.isfinite(command.setpoint_step_um) and math.isnan(command.value):
+        return "setpoint_step_um is for a trial: give its time as value"
     if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
         return "the tick rate cannot be changed during a run"
     if command.kind == "capture" and not config.shape.enabled:
@@ -149,6 +152,7 @@ class GainsTrial:
         self._good_shape_s = self._tried_shape_s = shape_time_constant_s
         self._good_pump = self._tried_pump = pump
         self._until_s = math.nan
+        self.setpoint_step_um = math.nan  # part of the trial; NaN: the setpoint and the shape loop are not
 
     @property
     def on_trial(self) -> bool:
@@ -162,9 +166,11 @@ class GainsTrial:
         trial_s: float,
         shape_time_constant_s: float = math.nan,
         pump: PumpConfig | None = None,
+        setpoint_step_um: float = math.nan,
     ) -> None:
         """Set new gains for `trial_s` seconds, or permanently if that is NaN."""
         self._tried, self._tried_pump = loop, pump or self._tried_pump
+        self.setpoint_step_um = setpoint_step_um
         if math.isfinite(shape_time_constant_s):
             self._tried_shape_s = shape_time_constant_s
         self._until_s = now_s + trial_s
@@ -185,6 +191,7 @@ class GainsTrial:
         """Keep the present gains."""
         self._good, self._good_shape_s, self._until_s = self._tried, self._tried_shape_s, math.nan
         self._good_pump = self._tried_pump
+        self.setpoint_step_um = math.nan
 
     def overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
@@ -194,4 +201,5 @@ class GainsTrial:
         """Restore the last good settings, and return the gains."""
         self._tried, self._tried_shape_s, self._until_s = self._good, self._good_shape_s, math.nan
         self._tried_pump = self._good_pump
+        self.setpoint_step_um = math.nan
         return self._good

@@ -54,6 +54,8 @@ class Controller:
         )
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
         self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s, config.pump)
+        self._setpoint_back_um = math.nan  # after a trial that steps the setpoint
+        self._shape_back = False  # likewise: the shape loop is on again
         self._consistency = sensor_consistency.SensorConsistency(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
@@ -173,6 +175,7 @@ class Controller:
             loop=_settings(command),
             experiment=None if spec is None else spec.model_dump(exclude=None if spec.steps else {"steps"}),
             shape_time_constant_s=_or_none(command.shape_time_constant_s),
+            setpoint_step_um=_or_none(command.setpoint_step_um),
             refused=refused or None,
         )
         events.append(taken)
@@ -192,16 +195,25 @@ class Controller:
                 scene.paused = command.kind == "pause"
             case "setpoint":
                 scene.setpoint_um = command.value
+                if math.isfinite(self._setpoint_back_um):  # it stays
+                    self._setpoint_back_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
                 self._gains.begin(
-                    command.loop, scene.now_s, command.value, command.shape_time_constant_s, command.pump
+                    command.loop,
+                    scene.now_s,
+                    command.value,
+                    command.shape_time_constant_s,
+                    command.pump,
+                    command.setpoint_step_um,
                 )
                 self._set_gains(command.loop)
             case "keep":
                 self._gains.keep()
+                self._step_setpoint()
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
+                self._shape_back = command.kind == "shape_on"
             case "latch":
                 scene.latched = scene.latched or command.text or f"locked by {command.who}"
                 scene.hold_wanted = scene.acknowledged = False
@@ -229,6 +241,10 @@ class Controller:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
         if command.kind in ("manual", "tune") and scene.levels.rung != Rung.NONE:
             return "the safety table holds the mean flow"
+        if math.isfinite(command.setpoint_step_um):
+            now_um = self._setpoint_back_um if math.isfinite(self._setpoint_back_um) else scene.setpoint_um
+            stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
+            return commands.refusal(stepped, self.state, self._config)
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
@@ -246,6 +262,20 @@ class Controller:
         scene.loop_config, scene.pump_config = loop, pump
         scene.loop.set_gains(loop)
         self._shape.set_memory(self._gains.shape_time_constant_s)
+        self._step_setpoint()
+
+    def _step_setpoint(self) -> None:
+        """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as before it."""
+        scene, step_um = self._scene, self._gains.setpoint_step_um
+        stepped = math.isfinite(self._setpoint_back_um)
+        if math.isfinite(step_um):
+            if not stepped:
+                self._setpoint_back_um, self._shape_back = scene.setpoint_um, self._shape.on
+                self._shape.switch(False, scene.now_s)
+            scene.setpoint_um = self._setpoint_back_um + step_um
+        elif stepped:
+            scene.setpoint_um, self._setpoint_back_um = self._setpoint_back_um, math.nan
+            self._shape.switch(self._shape_back, scene.now_s)
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
         self._set_gains(self._gains.revert())

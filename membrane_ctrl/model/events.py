@@ -96,6 +96,7 @@ class CommandTaken(Event, kind="command"):
     loop: Any = None
     experiment: Any = None
     shape_time_constant_s: float | None = None
+    setpoint_step_um: float | None = None
     refused: str | None = None
 
 

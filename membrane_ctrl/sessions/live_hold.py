@@ -100,8 +100,9 @@ class LiveHold:
         request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
         if math.isfinite(command.value):
             request["value"] = command.value
-        if math.isfinite(command.shape_time_constant_s):
-            request["shape_time_constant_s"] = command.shape_time_constant_s
+        for key in ("shape_time_constant_s", "setpoint_step_um"):
+            if math.isfinite(getattr(command, key)):
+                request[key] = getattr(command, key)
         if command.loop is not None:
             request["loop"] = command.loop.model_dump(exclude={"setpoint_um"})
         if command.pump is not None:

@@ -272,6 +272,69 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
     assert "outside" in refusal(tried(0.5), State.HOLD, CONFIG)
 
 
+class Stepped:
+    """A controller with its shape loop on and the setpoint at 2 um, told of trials that step the setpoint."""
+
+    def __init__(self) -> None:
+        self.controller = Controller(CONFIG, zernike_projection())
+        self.now_s = 0.0
+        self.told(Command("setpoint", "tester", value=2.1), Command("shape_on", "tester"))
+
+    def told(self, *commands: Command, after_s: float = 1.0) -> tuple[float, bool]:
+        self.now_s += after_s
+        out = self.controller.tick(TickInputs(now_s=self.now_s, dt_s=0.02, reading=None, commands=commands))
+        assert not any(refused for _, refused in out.answers), out.answers
+        return self.controller._scene.setpoint_um, self.controller._shape.on
+
+
+def stepped(step_um: float, trial_s: float = 10.0) -> Command:
+    return replace(gains(0.3, trial_s), setpoint_step_um=step_um)
+
+
+def test_a_setpoint_stepped_on_trial_and_the_shape_loop_come_back_by_themselves() -> None:
+    run = Stepped()
+    assert run.told(stepped(0.0)) == (2.1, False)
+    assert run.told(stepped(5.0)) == (7.1, False)
+    assert run.told(after_s=9.0) == (7.1, False)  # the second trial counts
+    assert run.told(after_s=2.0) == (2.1, True)
+    assert run.controller.loop_config == CONFIG.loop
+
+
+@pytest.mark.parametrize("ends", [gains(0.3), Command("keep", "tester")])
+def test_a_step_ends_with_its_trial_also_when_gains_stay(ends: Command) -> None:
+    run = Stepped()
+    run.told(stepped(5.0))
+    assert run.told(ends) == (2.1, True)
+    assert run.controller.loop_config.kp_per_s == 0.3
+
+
+def test_what_a_person_sets_during_a_step_stays() -> None:
+    run = Stepped()
+    run.told(stepped(5.0))
+    assert run.told(Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")) == (-1.0, False)
+    assert run.told(after_s=20.0) == (-1.0, False)
+
+
+def test_a_fault_ends_a_step() -> None:
+    held = Held()
+    held.go(2.0, stepped(5.0, 600.0))
+    held.bench.wrong.gauge_offset_pa = 500.0
+    held.go(1.0)
+    assert held._run._supervisor._controller._scene.setpoint_um == 0.0
+
+
+def test_a_step_survives_in_the_memory_of_a_controller() -> None:
+    run = Stepped()
+    run.told(stepped(5.0))
+    run.controller = recall(remember(run.controller), Controller(CONFIG, zernike_projection()))
+    assert run.told(after_s=20.0) == (2.1, True)
+
+
+def test_a_step_without_a_trial_or_beyond_the_limits_is_refused() -> None:
+    assert "for a trial" in refusal(stepped(5.0, math.nan), State.HOLD, CONFIG)
+    assert "outside the limits" in Stepped().controller._prepare(stepped(1e6))
+
+
 # Twice the true flow at every command: on it the mirror seems to lose twice its leak.
 TWICE = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 10.6), flow_full_um_per_s=10.6)
 

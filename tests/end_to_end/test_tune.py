@@ -111,7 +111,7 @@ def test_what_is_refused_says_why(logs: Path) -> None:
     link = connected(logs)
     rig = HoldRig(link, "tester")
     with pytest.raises(HoldError, match="refused"):
-        rig.setpoint(5000.0, "test")
+        rig.set_gains(rig.loop, "test", 5.0, setpoint_step_um=5000.0)
     link.close()
 
 

@@ -90,4 +90,4 @@ def test_a_fault_in_a_session_says_what_the_hold_is_in() -> None:
 def test_a_refused_command_is_an_error_with_the_reason() -> None:
     _, rig = held()
     with pytest.raises(HoldError, match="outside the limits"):
-        rig.setpoint(5000.0, "test")
+        rig.set_gains(rig.loop, "test", 5.0, setpoint_step_um=5000.0)

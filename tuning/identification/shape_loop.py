@@ -77,6 +77,7 @@ def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[fl
 STEP_UM = 5.0
 _LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle started earlier
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
+_LATE_S = 15.0  # that a level may take longer on a busy machine
 _LEAST_CYCLES = 8
 _SPARE_S, _BACK_S = 120.0, 1.0
 # Below ten cycles it would follow the noise; beyond an hour the drift is unknown.
@@ -98,24 +99,22 @@ class ShapeLoopFit:
     time_constant_s: float  # proposed for `shape.time_constant_s`
 
 
-def step_experiment(rig: HoldRig, setpoint_um: float, restore: bool) -> list[list[ShapeEstimate]]:
+def step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
     """Hold low, high, low with the shape loop off; return the shapes of each level.
 
-    It ends at `setpoint_um`, the hold's own; `restore` switches the shape loop on again.
+    Each level is a trial, after which the hold itself restores setpoint and shape loop, whatever became of the session.
     """
     levels: list[list[ShapeEstimate]] = []
-    rig.shape_loop(False, "shape loop: the step is the session's")
+    why = "shape loop: sag sensitivity"
     try:
-        for target_um in (setpoint_um, setpoint_um + STEP_UM, setpoint_um):
-            rig.setpoint(target_um, "shape loop: sag sensitivity")
+        for step_um in (0.0, STEP_UM, 0.0):
+            rig.set_gains(rig.loop, why, _SETTLE_S + _LEVEL_S + _LATE_S, setpoint_step_um=step_um)
             rig.hold(_SETTLE_S)
             before = len(rig.shapes)
             rig.hold(_LEVEL_S)
             levels.append([shape for shape in rig.shapes[before:] if shape.verdict != "rejected"])
     finally:
-        rig.setpoint(setpoint_um, "shape loop: back")
-        if restore:
-            rig.shape_loop(True, "shape loop: the step is over")
+        rig.set_gains(rig.loop, f"{why}: back")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
         raise HoldError(f"fewer than {_LEAST_CYCLES} shapes per level: is the shape measured every few seconds?")
     return levels
