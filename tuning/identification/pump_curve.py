@@ -10,6 +10,7 @@ same one reached from below. The leak may change within a minute; n is white noi
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -20,9 +21,14 @@ _BEFORE_S = 8.0  # a flow that was on its way before the first command has arriv
 _LEAK_S = 40.0  # between the nodes of the leak's course
 _LEAK_CHANGES_UM_PER_S = 0.2  # what the weather's slow course looks like: 1.5 mK/s of the air
 _BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
-_WHITEST = 0.995
-_ROUGHNESS = np.geomspace(0.5, 2e4, 16)  # of the curve: square of its second derivative, of the full flow
+_WHITES = (0.9, 0.97, 0.99, 0.997, 0.9995)
 _DELAYS_S, _LAGS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2), (0.1, 0.4, 1.0, 2.0)
+_TURNS, _ENOUGH = 8, 0.2  # of the likelihood's search
+_OFF = np.array([-3, -2])  # columns of delay and lag
+_OFF_S, _SLOPE_S = 1.0, 0.05  # what delay and lag may be off; for their slopes
+_LEAST_S, _MOST_S = 0.01, 4.0
+_ROUGH = np.geomspace(0.02, 2e4, 8)  # of the curve: square of its second derivative, of the full flow
+_KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -70,10 +76,16 @@ class PumpFit:
     """What the runs say of the pump and the leak."""
 
     levels: dict[Level, FlowAt]
+    covariance: FloatArray  # of the levels' flows, in their order
     leak_um_per_s: float
     delay_s: float
     lag_s: float
     share_white: float  # of the noise: 1 - 1/(blocks that the random walk takes to show)
+
+    @property
+    def actuator(self) -> tuple[float, float]:
+        """Delay and lag in s."""
+        return self.delay_s, self.lag_s
 
     @property
     def answer_s(self) -> float:
@@ -81,14 +93,30 @@ class PumpFit:
         return self.delay_s + 3 * self.lag_s
 
 
+NO_FIT = PumpFit({}, np.empty((0, 0)), 0.0, 0.0, 0.0, 0.8)
+
+
 @dataclass(frozen=True, slots=True)
 class _Blocks:
     """A run in blocks of `_BLOCK_S`: the paths of its levels before the actuator, beginning before the run."""
 
+    columns: list[int]  # which of all levels these are
     paths: FloatArray  # (before + n, levels + 1); the last is what flowed before
-    fixed: FloatArray  # (n, ...): nodes of the leak
+    leak: FloatArray  # (n, nodes): paths of the nodes of its course
     pressure_pa: FloatArray  # (n,)
     displacement_um: FloatArray  # (n,)
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """The linear unknowns behind an actuator: flow of each level, leak, pressure, (what delay and lag are off)."""
+
+    delay_s: float
+    lag_s: float
+    white: float
+    cost: float  # twice the negative log likelihood
+    values: FloatArray
+    covariance: FloatArray
 
 
 def levels_of(run: PumpRun) -> list[Level | None]:
@@ -108,42 +136,81 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
 
     Raises ValueError for runs without readings, or too short.
     """
-    from scipy.optimize import minimize
-
     levels = sorted({level for run in runs for level in levels_of(run) if level is not None})
-    blocks = [_blocks(run, levels) for run in runs]
-    has_pressure = all(np.isfinite(block.pressure_pa).all() for block in blocks)
-    heights = [block.displacement_um for block in blocks]
-    noise_um = float(np.median(np.abs(np.hstack([np.diff(height, 2) for height in heights])))) / 0.6745 / math.sqrt(6)
+    model = _Mirror([_blocks(run, levels) for run in runs], len(levels))
+    starts = product(_DELAYS_S, _LAGS_S, _WHITES[1:2]) if near is None else ((*near.actuator, near.share_white),)
+    best = min((model.solved(*start) for start in starts), key=_cost)
+    for _ in range(_TURNS):
+        better = min((model.improved(best), *(model.solved(best.delay_s, best.lag_s, w) for w in _WHITES)), key=_cost)
+        enough = best.cost - better.cost < _ENOUGH
+        best = better
+        if enough:
+            break
+    return model.fitted(best, levels)
 
-    def gram(at: FloatArray) -> FloatArray:
-        return np.asarray(sum(_gram(block, np.abs(at), has_pressure, noise_um) for block in blocks))
 
-    rows = sum(height.size for height in heights)
+class _Mirror:
+    """The mirror as a flow meter: the likelihood of its runs behind an actuator and in noise.
 
-    def cost(at: FloatArray) -> float:
-        return math.log(_least_squares(gram(at), rows)[0]) if at[2] < _WHITEST else math.inf
+    Delay and lag are linear unknowns as well, about where they are: Gauss and Newton's step, and their share of the
+    errors.
+    """
 
-    starts = [np.array([near.delay_s, near.lag_s, near.share_white])] if near is not None else [
-        np.array([delay_s, lag_s, 0.95]) for delay_s in _DELAYS_S for lag_s in _LAGS_S
-    ]  # fmt: skip
-    start = min(starts, key=cost)
-    size = 0.15 if near is None else 0.04
-    simplex = start + size * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -0.6]])
-    options = {"maxfev": 60 if near is None else 25, "xatol": 0.003, "initial_simplex": simplex}
-    best = minimize(cost, start, method="Nelder-Mead", options=options).x  # type: ignore[call-overload]
-    # no pump takes gas out: what looks so is one without flow, and the rest is judged again without it
-    whole, keep, none = gram(best), np.arange(len(levels) + 1 + has_pressure + 1), [True]
-    flows = dict[Level, FlowAt]()
-    while any(none):
-        _, values, sigmas = _least_squares(whole[np.ix_(keep, keep)], rows)
-        pumping = keep[keep < len(levels)]
-        none = [values[k] < 0 for k in range(pumping.size)]
-        for k, i in enumerate(pumping.tolist()):
-            flows[levels[i]] = FlowAt(max(float(values[k]), 0.0), float(sigmas[k]))
-        keep = np.delete(keep, np.flatnonzero(none))
-        leak_um_per_s = float(values[pumping.size])
-    return PumpFit(flows, leak_um_per_s, *(float(abs(x)) for x in best))
+    def __init__(self, blocks: Sequence[_Blocks], levels: int) -> None:
+        self._blocks, self._levels = blocks, levels
+        self._has_pressure = all(np.isfinite(block.pressure_pa).all() for block in blocks)
+        bends = np.hstack([np.diff(block.displacement_um, 2) for block in blocks])
+        self._noise_um = float(np.median(np.abs(bends))) / 0.6745 / math.sqrt(6)
+        self._rows = sum(block.displacement_um.size for block in blocks)
+
+    def solved(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None = None) -> _Solved:
+        """Flows behind an actuator; with `flows` also how far delay and lag are off, if those flowed."""
+        gram, cost = self._gram(delay_s, lag_s, white, flows)
+        here = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
+        variance, values, covariance = _least_squares(here, self._rows)
+        cost += self._rows * math.log(variance)
+        if flows is not None:
+            gram[_OFF, _OFF] += self._noise_um**2 / _OFF_S**2
+            _, values, covariance = _least_squares(gram, self._rows)
+        return _Solved(delay_s, lag_s, white, cost, values, covariance)
+
+    def improved(self, best: _Solved) -> _Solved:
+        """With a better delay and lag, if there are any."""
+        off = self.solved(best.delay_s, best.lag_s, best.white, best.values).values[-2:]
+        for share in (1.0, 0.4, 0.1):
+            delay_s, lag_s = np.clip((best.delay_s, best.lag_s) + share * off, _LEAST_S, _MOST_S).tolist()
+            found = self.solved(delay_s, lag_s, best.white)
+            if found.cost < best.cost:
+                return found
+        return best
+
+    def fitted(self, best: _Solved, levels: Sequence[Level]) -> PumpFit:
+        """The flows of the levels, with the share of delay and lag in their errors."""
+        found = self.solved(best.delay_s, best.lag_s, best.white, best.values)
+        count = len(levels)
+        covariance = found.covariance[:count, :count]
+        columns = found.values[:count].tolist(), np.sqrt(np.diag(covariance)).tolist()
+        flows = {level: FlowAt(*at) for level, *at in zip(levels, *columns, strict=True)}
+        return PumpFit(flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, best.white)
+
+    def _gram(
+        self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None
+    ) -> tuple[FloatArray, float]:
+        """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's determinant."""
+        last = self._levels + np.arange(5)
+        whole, determinant = np.zeros((self._levels + 5,) * 2), 0.0
+        for block in self._blocks:
+            given = np.zeros(len(block.columns) + 1) if flows is None else flows[[*block.columns, self._levels]]
+            columns = _whitened(block, (delay_s, lag_s, white), given, self._has_pressure)
+            gram, logarithm = _without_own(columns, block.leak.shape[1], white, self._noise_um)
+            at = np.append(block.columns, last).astype(int)
+            whole[np.ix_(at, at)] += gram
+            determinant += logarithm
+        return whole, determinant
+
+
+def _cost(found: _Solved) -> float:
+    return found.cost
 
 
 def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
@@ -156,82 +223,115 @@ def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
     def mean(column: FloatArray) -> FloatArray:
         return np.asarray(column[: count * size].reshape(count, size, *column.shape[1:]).mean(axis=1))
 
-    index = {level: i for i, level in enumerate(levels)}
-    on = np.zeros((run.fraction.size + 1, len(levels)))
-    for tick, level in enumerate(levels_of(run), start=1):
+    given = levels_of(run)
+    own = sorted({level for level in given if level is not None})
+    on = np.zeros((run.fraction.size + 1, len(own)))
+    for tick, level in enumerate(given, start=1):
         if level is not None:
-            on[tick, index[level]] = run.dt_s
-    before = np.zeros((round(_BEFORE_S / (size * run.dt_s)), len(levels)))
+            on[tick, own.index(level)] = run.dt_s
+    before = np.zeros((round(_BEFORE_S / (size * run.dt_s)), len(own)))
     paths = np.vstack((before, mean(np.cumsum(on, axis=0)[:-1])))
     time_s = size * run.dt_s * np.arange(-before.shape[0], count)
-    paths = np.column_stack((paths, np.minimum(time_s, 0.0)))
     now_s = time_s[before.shape[0] :]
     nodes = np.linspace(0.0, now_s[-1], 1 + max(1, round(now_s[-1] / _LEAK_S)))
     hats = np.column_stack([np.interp(now_s, nodes, unit) for unit in np.eye(nodes.size)])
     filled = np.interp(np.arange(good.size), np.flatnonzero(good), run.displacement_um[good])
-    return _Blocks(paths, np.cumsum(hats, axis=0) * size * run.dt_s, mean(run.ambient_pressure_pa), mean(filled))
+    return _Blocks(
+        columns=[levels.index(level) for level in own],
+        paths=np.column_stack((paths, np.minimum(time_s, 0.0))),
+        leak=np.cumsum(hats, axis=0) * size * run.dt_s,
+        pressure_pa=mean(run.ambient_pressure_pa),
+        displacement_um=mean(filled),
+    )
 
 
-def _gram(block: _Blocks, at: FloatArray, has_pressure: bool, noise_um: float) -> FloatArray:
-    """Products of the columns levels, leak, (pressure,) height of a run, after what belongs to this run alone.
+def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
+    """Paths behind the actuator; what flows at the beginning had flowed forever."""
+    from scipy.signal import lfilter
 
-    These are the course of the leak, what the pump gave before the run, and the noise of the first reading.
+    late = delay_s / _BLOCK_S
+    whole, part = int(late), late - int(late)
+    earlier = paths[0] - (paths[1] - paths[0]) * np.arange(whole + 1, 0, -1)[:, None]
+    held = np.vstack((earlier, paths))
+    rows = paths.shape[0]
+    given = (1 - part) * held[1 : rows + 1] + part * held[:rows]
+    keep = math.exp(-_BLOCK_S / lag_s)
+    return np.asarray(lfilter([1 - keep], [1, -keep], given - given[0], axis=0))
+
+
+def _whitened(
+    block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool
+) -> FloatArray:
+    """Columns levels, before, leak, pressure, delay, lag, height, differenced so that the noise is white.
+
+    Those of delay and lag say what a second more of them changes, with these flows of the levels and before.
     """
-    paths, nodes, rest = np.split(
-        _whitened(block, at), np.cumsum([block.paths.shape[1], block.fixed.shape[1]]), axis=1
-    )
-    levels, before = paths[:, :-1], paths[:, -1:]
-    leak = before - nodes.sum(axis=1, keepdims=True)  # before the run the pump gave what leaks
-    shared = np.hstack((levels, leak, rest if has_pressure else rest[:, 1:]))
-    first = at[2] ** np.arange(1, before.size + 1)[:, None]
-    own = np.hstack((nodes, before, first))
-    spread = np.array([*[_LEAK_CHANGES_UM_PER_S] * nodes.shape[1], _BEFORE_UM_PER_S, noise_um])
-    across = own.T @ shared
-    return np.asarray(
-        shared.T @ shared - across.T @ np.linalg.solve(own.T @ own + np.diag((noise_um / spread) ** 2), across)
-    )
-
-
-def _whitened(block: _Blocks, at: FloatArray) -> FloatArray:
-    """Paths behind the actuator, leak, pressure and height, differenced so that the noise is white."""
     from scipy.signal import lfilter
 
     delay_s, lag_s, white = at
-    late = delay_s / _BLOCK_S
-    whole, part = int(late), late - int(late)
-    held = np.vstack((np.repeat(block.paths[:1], whole + 1, axis=0), block.paths))
-    if block.paths.shape[0] > 1:  # what flowed before had flowed forever
-        held[: whole + 1, -1] -= _BLOCK_S * np.arange(whole + 1, 0, -1)
-    rows = block.paths.shape[0]
-    paths = (1 - part) * held[1 : rows + 1] + part * held[:rows]
-    keep = np.exp(-_BLOCK_S / max(lag_s, 1e-3))
-    paths = lfilter([1 - keep], [1, -keep], paths - paths[0], axis=0)
-    arrived = paths[-block.displacement_um.size :]
-    columns = np.column_stack((arrived, block.fixed, np.nan_to_num(block.pressure_pa), block.displacement_um))
+    count = block.displacement_um.size
+    given = block.paths @ flows[:, None]
+    slopes = [
+        (_arrived(given, delay_s + more_s, lag_s + slower_s) - _arrived(given, delay_s, lag_s)) / _SLOPE_S
+        for more_s, slower_s in ((_SLOPE_S, 0.0), (0.0, _SLOPE_S))
+    ]
+    columns = np.column_stack((
+        _arrived(block.paths, delay_s, lag_s)[-count:],
+        block.leak,
+        block.pressure_pa if has_pressure else np.zeros(count),
+        *(slope[-count:] for slope in slopes),
+        block.displacement_um,
+    ))  # fmt: skip
     return np.asarray(lfilter([1.0], [1.0, -white], np.diff(columns, axis=0), axis=0))
 
 
+def _without_own(columns: FloatArray, nodes: int, white: float, noise_um: float) -> tuple[FloatArray, float]:
+    """Products of a run's columns levels, leak, pressure, delay, lag, height, after what belongs to this run alone.
+
+    These are the course of the leak, what the pump gave before the run, and the noise of the first reading. Also the
+    logarithm of their determinant.
+    """
+    paths, leak, rest = np.split(columns, (-4 - nodes, -4), axis=1)
+    levels, before = paths[:, :-1], paths[:, -1:]
+    # before the run the pump gave what leaks
+    shared = np.hstack((levels, before - leak.sum(axis=1, keepdims=True), rest))
+    first = white ** np.arange(1, before.size + 1)[:, None]
+    own = np.hstack((leak, before, first))
+    spread = np.array([*[_LEAK_CHANGES_UM_PER_S] * nodes, _BEFORE_UM_PER_S, noise_um])
+    across, inner = own.T @ shared, own.T @ own + np.diag((noise_um / spread) ** 2)
+    gram = shared.T @ shared - across.T @ np.linalg.solve(inner, across)
+    return np.asarray(gram), float(np.linalg.slogdet(inner)[1])
+
+
 def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray]:
-    """Variance of the residual, values, standard errors, from the columns' products; the last is the reading."""
+    """Variance of the residual, values, their covariance, from the columns' products; the last is the reading."""
     scale = np.maximum(np.sqrt(np.diag(gram)[:-1]), 1e-9)
     inverse = np.linalg.inv(gram[:-1, :-1] / np.outer(scale, scale) + 1e-9 * np.eye(scale.size))
     values = inverse @ (gram[:-1, -1] / scale) / scale
     variance = max(float(gram[-1, -1] - values @ gram[:-1, -1]) / max(1, rows - scale.size), 1e-12)
-    return variance, values, np.sqrt(variance * np.diag(inverse)) / scale
+    return variance, values, variance * inverse / np.outer(scale, scale)
 
 
-def smoothed(fractions: FloatArray, flows: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The likeliest cubic smoothing spline through noisy flows, and its standard errors (Wahba 1978)."""
+def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that of the flows.
+
+    The average over cubic and linear smoothing splines by their likelihood (Wahba 1978): most curves are smooth, some
+    have kinks.
+    """
     x, full = fractions - fractions[0], max(float(flows.max()), 1e-3)
     low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
     bend, line = low**2 * (3 * high - low) / 6, 10.0 * (1 + np.outer(x, x))
-    noise = np.diag((sigmas / full) ** 2)
-
-    def unlikely(roughness: float) -> float:
-        covariance = line + roughness * bend + noise
-        y = flows / full
-        return float(y @ np.linalg.solve(covariance, y) + np.linalg.slogdet(covariance)[1])
-
-    free = line + min(_ROUGHNESS.tolist(), key=unlikely) * bend
-    weights = np.linalg.solve(free + noise, free).T
-    return weights @ flows, full * np.sqrt(np.maximum(np.diag(free - weights @ free), 1e-12))
+    y, noise = flows / full, noise / full**2
+    found: list[tuple[float, FloatArray, FloatArray]] = []
+    for rough, kinked in product(_ROUGH, _KINKED):
+        free = line + rough * bend + kinked * low
+        weights = np.linalg.solve(free + noise, free).T
+        cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
+        found.append((cost, weights @ y, free - weights @ free))
+    costs, means, covariances = (np.array(column) for column in zip(*found, strict=True))
+    share = np.exp(-0.5 * (costs - costs.min()))
+    share /= share.sum()
+    mean = share @ means
+    apart = means - mean
+    spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
+    return full * mean, full**2 * spread

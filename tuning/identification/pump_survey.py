@@ -14,7 +14,7 @@ import numpy as np
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.trial import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
+from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, PumpRun, fit, smoothed
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _USEFUL_SHARE = 0.02  # beyond it there is no curve
@@ -27,6 +27,7 @@ _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
+_NONE_UM_PER_S = 1e-3  # at command 0
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
 _ABOVE = 0.15
@@ -65,7 +66,7 @@ class PumpSurvey:
     holding_fraction: float
     limit_um: float = 10.0
     runs: list[PumpRun] = field(default_factory=list)
-    fit: PumpFit = field(default_factory=lambda: PumpFit({}, 0.0, 0.0, 0.0, 0.8))
+    fit: PumpFit = NO_FIT
     dark: int = 0  # the latest runs that ended without a reading
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
     _rounds: int = 0
@@ -140,16 +141,19 @@ class PumpSurvey:
         """One branch, from no flow at command 0; its flows never fall, and are as smooth as they look."""
         from scipy.optimize import isotonic_regression
 
-        at = {level.fraction: flow for level, flow in self.fit.levels.items() if level.rising == rising}
-        at[0.0] = FlowAt(0.0, 1e-3)
-        fractions = np.array(sorted(at))
-        flows = np.array([at[f].flow_um_per_s for f in fractions.tolist()])
-        sigmas = np.array([at[f].sigma_um_per_s for f in fractions.tolist()])
-        rising_flows = np.asarray(isotonic_regression(flows, weights=sigmas**-2.0).x)
+        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising]
+        at = [(level.fraction, flow.flow_um_per_s) for level, flow in self.fit.levels.items() if level.rising == rising]
+        fractions, flows = np.array([(0.0, 0.0), *at]).T
+        noise = np.zeros((fractions.size,) * 2)
+        noise[0, 0] = _NONE_UM_PER_S**2
+        noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
+        weights = 1 / np.diag(noise)
+        rising_flows = np.asarray(isotonic_regression(flows, weights=weights).x)
         jump = _jump(fractions, rising_flows, self.full_um_per_s)
         first = int(np.searchsorted(fractions, jump[1])) if jump is not None else 0
         flows[:first] = rising_flows[:first]
-        flows[first:], sigmas[first:] = smoothed(fractions[first:], flows[first:], sigmas[first:])
+        flows[first:], noise[first:, first:] = smoothed(fractions[first:], flows[first:], noise[first:, first:])
+        sigmas = np.sqrt(np.maximum(np.diag(noise), 0.0))
         return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
     def start(self) -> tuple[float, float] | None:
