@@ -1,5 +1,6 @@
 """What a person decides: which candidate is applied, and whether kept gains become those of the configuration."""
 
+import contextlib
 import difflib
 import json
 import sys
@@ -90,27 +91,33 @@ _ANY = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> int:
-    """Save a session's kept gains and curve of the pump, by default those kept last, into a configuration file.
+    """Save what a session kept into a configuration file: gains, curve of the pump, time constant of the shape loop.
 
-    Returns the exit code.
+    By default the gains and the time constant that were kept last. Returns the exit code.
 
     Shows the difference and asks; without a terminal only `yes` writes. Comments stay.
 
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
-    if name is None:
-        name = logs / "tuning" / gains_file.to_roll_back(logs, gains_only=True).session
-    folder = open_session(name)
-    gains = _kept(folder)
+    folder, shape_s = _named(name, logs)
     config = toml_file.load(path, schema.Config)
-    pump = folder.config.pump
-    replaces = pump_trial.mapped(folder) and config.pump == pump_trial.mapped_of(folder).before
-    _require_same_bench(path, config.model_copy(update={"pump": pump}) if replaces else config, folder)
+    gains, pump = config.loop, config.pump
+    if shape_s is None or folder.done("verify") or pump_trial.mapped(folder):
+        gains, pump = _kept(folder), folder.config.pump
+        replaces = pump_trial.mapped(folder) and config.pump == pump_trial.mapped_of(folder).before
+        _require_same_bench(path, config.model_copy(update={"pump": pump}) if replaces else config, folder)
+    else:
+        _require_same_devices(path, config, folder)
     before = files.read_text(path, follow=True)
-    changed = {"loop": _changes(config.loop, gains, GAIN_KEYS), "pump": _changes(config.pump, pump)}
+    shape = config.shape.model_copy(update={"time_constant_s": shape_s or config.shape.time_constant_s})
+    changed = {
+        "loop": _changes(config.loop, gains, GAIN_KEYS),
+        "pump": _changes(config.pump, pump),
+        "shape": _changes(config.shape, shape),
+    }
     after = _with(before, changed, path)
     loop = schema.LoopConfig.model_validate(config.loop.model_dump() | changed["loop"])
-    require_sound(config.model_copy(update={"loop": loop, "pump": pump}), str(path))
+    require_sound(config.model_copy(update={"loop": loop, "pump": pump, "shape": shape}), str(path))
     if not any(changed.values()):
         print(f"{path} already has the gains of {folder.path.name}")
         return errors.Exit.DONE
@@ -125,6 +132,21 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     told = gains_file.entry("saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains)
     gains_file.note(folder.path.resolve().parents[1], told)
     return errors.Exit.DONE
+
+
+def _named(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
+    """A session, by default the one whose gains were kept last; and the time constant of the shape loop it kept.
+
+    By default that is the one kept last. Raises InputError if nothing was kept.
+    """
+    if name is not None:
+        folder = open_session(name)
+        return folder, gains_file.kept_shape_s(folder.path.resolve().parents[1], folder.path.name)
+    shape_s = gains_file.kept_shape_s(logs)
+    newest = gains_file.to_roll_back(logs)
+    with contextlib.suppress(InputError):
+        newest = gains_file.to_roll_back(logs, gains_only=True)
+    return open_session(logs / "tuning" / newest.session), shape_s
 
 
 def _changes(old: Section, new: Section, keys: Collection[str] = ()) -> dict[str, Any]:
@@ -150,11 +172,16 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
     return done.after
 
 
-def _require_same_bench(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
-    """Raises InputError if the gains are for another pump, another loop, or the simulated bench."""
-    tuned = folder.config
-    if config.devices is not None and (tuned.devices is None or folder.head.source == "twin"):
+def _require_same_devices(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
+    """Raises InputError if the session tuned the simulated bench, and the configuration is another."""
+    if config.devices is not None and (folder.config.devices is None or folder.head.source == "twin"):
         raise InputError(f"{path}: has [devices], but the session tuned the simulated bench")
+
+
+def _require_same_bench(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
+    """Raises InputError if the gains are for another pump or another loop."""
+    _require_same_devices(path, config, folder)
+    tuned = folder.config
     for section in ("pump", "loop"):
         here, there = getattr(config, section), getattr(tuned, section)
         for key in type(here).model_fields:

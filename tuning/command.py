@@ -146,7 +146,7 @@ def outer(options: TuneOptions) -> int:
             f"taken back: {done.reason}"
             if done.reason
             else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} um (before "
-            f"{done.error_before_um:.2f} um); for the next hold set shape.time_constant_s = {done.after_s:.0f}"
+            f"{done.error_before_um:.2f} um); `membrane-ctrl tune save --config FILE` saves it for the next one"
         )
     code = _concluded(folder, options)
     return Exit.REJECTED if done.reason else code

@@ -6,6 +6,7 @@ or have too little margin are refused by name.
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -190,14 +191,27 @@ def to_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
 
     A time constant of the shape loop counts too, unless `gains_only`.
     """
+    for found in _in_force(logs):
+        if found.shape_s is None or not gains_only:
+            return found
+    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
+
+
+def kept_shape_s(logs: Path, session: str = "") -> float | None:
+    """The shape loop's time constant kept last, by any or this session, and not rolled back since."""
+    of_it = (line.shape_s for line in _in_force(logs) if session in ("", line.session))
+    return next((shape_s[1] for shape_s in of_it if shape_s is not None), None)
+
+
+def _in_force(logs: Path) -> Iterator[GainsEntry]:
+    """What was kept and not rolled back since, newest first."""
     undone: set[tuple[str, bool]] = set()
     for found in reversed(entries(logs)):
         of = (found.session, found.shape_s is None)
         if found.what == "rolled_back":
             undone.add(of)
-        elif found.what == "kept" and of not in undone and (found.shape_s is None or not gains_only):
-            return found
-    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
+        elif found.what == "kept" and of not in undone:
+            yield found
 
 
 def history_table(found: list[GainsEntry]) -> str:

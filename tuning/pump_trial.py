@@ -77,7 +77,8 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
     _returned(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     curve = gas.PumpCurve(rig.pump)
-    survey = pump_survey.PumpSurvey(curve.fraction(around.holding_flow_um_per_s), around.limit_um)
+    holding = curve.fraction(around.holding_flow_um_per_s)
+    survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     while steps := survey.steps():
         around = replace(around, holding_flow_um_per_s=curve.flow(survey.holding))
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})

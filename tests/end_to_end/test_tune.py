@@ -102,6 +102,40 @@ def test_the_hold_ends_the_experiment_of_a_session_that_has_gone(logs: Path) -> 
     watcher._link.close()
 
 
+STEPS_AND_IS_KILLED = """
+import sys
+from pathlib import Path
+from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.sessions.live_hold import LiveHold
+from tuning.identification import shape_loop
+from tuning.rig import HoldRig
+
+logs = Path(sys.argv[1])
+client = PortClient.unix(logs / "control.sock", print)
+shape_loop._SETTLE_S, shape_loop._LEVEL_S, shape_loop._LATE_S = 0.5, 2.0, 2.0
+shape_loop.step_experiment(HoldRig(LiveHold(client, logs / client.greeting["run"]), "doomed"))
+"""
+
+
+def test_the_hold_takes_the_setpoint_back_from_a_killed_session(logs: Path) -> None:
+    watcher = connected(logs)
+    doomed = subprocess.Popen([sys.executable, "-c", STEPS_AND_IS_KILLED, str(logs)])
+    give_up_s = time.monotonic() + PATIENCE_S
+
+    def setpoint_um() -> float:
+        assert time.monotonic() < give_up_s
+        return watcher.news().rows[-1].setpoint_um
+
+    while setpoint_um() < 3.0:
+        pass
+    doomed.kill()
+    doomed.wait(PATIENCE_S)
+    while setpoint_um() > 0.01:
+        pass
+    assert watcher.news().rows[-1].state == State.HOLD
+    watcher.close()
+
+
 def connected_in_any_state(logs: Path) -> LiveHold:
     client = PortClient.unix(logs / "control.sock", lambda text: None)
     return LiveHold(client, logs / client.greeting["run"])

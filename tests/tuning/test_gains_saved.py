@@ -13,7 +13,7 @@ from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
 from tuning import choice
-from tuning.gains_file import entries, entry, note
+from tuning.gains_file import What, entries, entry, note
 from tuning.identification.pump_survey import PumpMap
 from tuning.pump_trial import MappedPump
 from tuning.session import Verified
@@ -239,6 +239,41 @@ def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
     capsys.readouterr()
     assert run(["tune", "save", "--config", str(path), str(session)]) == Exit.DONE
     assert "already has" in capsys.readouterr().out
+
+
+def kept_time_constant(logs: Path, name: str = "outer", what: What = "kept") -> Path:
+    """A session that tried a time constant of the shape loop and measured nothing else."""
+    session = plain.create_session(logs, name, "eve", "a-run", Config(), BEFORE)
+    note(logs, entry(what, session.path.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5)))
+    return session.path
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_the_time_constant_of_the_shape_loop_is_saved_without_gains(tmp_path: Path, named: bool) -> None:
+    session, path = kept_time_constant(tmp_path / "logs"), tmp_path / "lab.toml"
+    assert saved(path, "--yes", *([str(session)] if named else [])) == Exit.DONE
+    wanted = tomllib.loads(TEXT)
+    assert tomllib.loads(path.read_text()) == wanted | {"shape": wanted["shape"] | {"time_constant_s": 62.5}}
+
+
+def test_gains_and_time_constant_of_two_sessions_are_saved_at_once_and_a_named_one_alone(tmp_path: Path) -> None:
+    gains, path = kept_session(tmp_path / "logs"), tmp_path / "lab.toml"
+    kept_time_constant(tmp_path / "logs")
+    assert saved(path, "--yes") == Exit.DONE
+    found = load(path, Config)
+    assert (found.loop.kp_per_s, found.shape.time_constant_s) == (0.448, 62.5)
+    assert saved(path, str(gains), "--yes") == Exit.DONE
+    assert load(path, Config).shape.time_constant_s == Config().shape.time_constant_s
+
+
+def test_a_time_constant_that_was_not_kept_or_rolled_back_is_not_saved(tmp_path: Path) -> None:
+    logs, path = tmp_path / "logs", tmp_path / "lab.toml"
+    session = kept_time_constant(logs, what="taken_back")
+    assert saved(path, str(session), "--yes") == saved(path, "--yes") == Exit.BAD_INPUT
+    session = kept_time_constant(logs, "second")
+    note(logs, entry("rolled_back", session.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5)))
+    assert saved(path, "--yes") == Exit.BAD_INPUT
+    assert path.read_text() == TEXT
 
 
 def test_a_curve_is_not_saved_over_that_of_another_pump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

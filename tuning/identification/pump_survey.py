@@ -18,11 +18,12 @@ from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, Pum
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _USEFUL_SHARE = 0.02  # beyond it there is no curve
+_STUCK_LEAKS = 0.3  # a pump that surely gives less, at any command
 _REACHES_LEAKS = 1.2
-_BENT_SHARE = 0.02  # a level that its neighbours predict worse than this gets nearer neighbours
+_BENT_SHARE = 0.035  # of the full flow, by which a kink between two levels may be hidden
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
-_JUMP_SHARE = 0.05  # flow at which a pump starts or stalls at once
-_EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.06, 0.04  # commands between which a jump lies, at worst; levels for a bend
+_NONE_SHARE, _JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
+_EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.1, 0.04  # commands between which a jump lies, at worst; levels for a bend
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
@@ -59,12 +60,13 @@ class PumpSurvey:
     ----------
     holding_fraction : float
         Command that about holds the mirror.
-    limit_um : float
-        Excursion limit of an experiment.
+    limit_um, laser_um : float
+        Excursion limit of an experiment; standard deviation of a reading.
     """
 
     holding_fraction: float
     limit_um: float = 10.0
+    laser_um: float = 0.5
     runs: list[PumpRun] = field(default_factory=list)
     fit: PumpFit = NO_FIT
     dark: int = 0  # the latest runs that ended without a reading
@@ -96,9 +98,10 @@ class PumpSurvey:
         if not self._sure()[0].size:
             if self._rounds >= _FIRST_ROUNDS:
                 return ()
-            first = min(1.0, self.holding_fraction + 0.1)
+            first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds))
+            rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
             pulses = [
-                (_for(0.0, 20.0, -1.5), _for(first, longest_s * self._share, 1.0), _for(0.0, 0.5))
+                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s * self._share, rise_um), _for(0.0, 0.5))
                 for longest_s in _FIRST_PULSES_S
             ]
             return tuple(step for pulse in pulses for step in pulse)
@@ -132,24 +135,25 @@ class PumpSurvey:
 
     def sigma(self, level: Level) -> float:
         """Standard error of its flow in um/s, with what its neighbours tell; infinite for one not visited."""
-        if level not in self.fit.levels:
-            return math.inf
         branch = self._branches[level.rising]
-        return float(branch.sigmas[np.searchsorted(branch.fractions, level.fraction)])
+        at = np.flatnonzero(branch.fractions == level.fraction)
+        return float(branch.sigmas[at[0]]) if at.size else math.inf
 
     def _branch(self, rising: bool) -> Branch:
         """One branch, from no flow at command 0; its flows never fall, and are as smooth as they look."""
         from scipy.optimize import isotonic_regression
 
-        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising]
-        at = [(level.fraction, flow.flow_um_per_s) for level, flow in self.fit.levels.items() if level.rising == rising]
+        asked = [level in self._wanted or not self._wanted for level in self.fit.levels]  # not just passed through
+        own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising and asked[i]]
+        levels = list(self.fit.levels.items())
+        at = [(levels[i][0].fraction, levels[i][1].flow_um_per_s) for i in own]
         fractions, flows = np.array([(0.0, 0.0), *at]).T
         noise = np.zeros((fractions.size,) * 2)
         noise[0, 0] = _NONE_UM_PER_S**2
         noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
         weights = 1 / np.diag(noise)
         rising_flows = np.asarray(isotonic_regression(flows, weights=weights).x)
-        jump = _jump(fractions, rising_flows, self.full_um_per_s)
+        jump = _jump(Branch(fractions, rising_flows, weights**-0.5), self.full_um_per_s)
         first = int(np.searchsorted(fractions, jump[1])) if jump is not None else 0
         flows[:first] = rising_flows[:first]
         flows[first:], noise[first:, first:] = smoothed(fractions[first:], flows[first:], noise[first:, first:])
@@ -158,8 +162,7 @@ class PumpSurvey:
 
     def start(self) -> tuple[float, float] | None:
         """The command at which a standing pump starts with a flow at once, and the one below it, if it does."""
-        rising = self._branches[True]
-        return _jump(rising.fractions, rising.flows, self.full_um_per_s)
+        return _jump(self._branches[True], self.full_um_per_s)
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
@@ -195,8 +198,6 @@ class PumpSurvey:
 
     def _finer(self, rising: bool) -> list[float]:
         """Commands between those of a branch, where it bends or jumps."""
-        from scipy.interpolate import PchipInterpolator
-
         fractions, flows, sigmas = self._branches[rising].columns
         full = self.full_um_per_s
         found: list[float] = []
@@ -206,12 +207,9 @@ class PumpSurvey:
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
-        for i in range(1, fractions.size - 1):
-            others = np.arange(fractions.size) != i
-            off = abs(float(PchipInterpolator(fractions[others], flows[others])(fractions[i])) - flows[i])
-            for low, high in pairwise(fractions[i - 1 : i + 2].tolist()):
-                if off > _BENT_SHARE * full + sigmas[i] and high - low > _NEAREST:
-                    found.append(_rounded((low + high) / 2))
+        for (low, high), off in zip(pairwise(fractions.tolist()), _may_bend(fractions, flows), strict=True):
+            if off > _BENT_SHARE * full and high - low > _NEAREST:
+                found.append(_rounded((low + high) / 2))
         return found
 
     def _from_above(self) -> list[float]:
@@ -304,42 +302,22 @@ class PumpSurvey:
         """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
         from scipy.optimize import isotonic_regression
 
-        if not self.fit.levels:
-            raise ValueError(
-                "the experiments were stopped too early: run `tune pump` again in steadier weather, or with a larger "
-                "--limit-um"
-            )
-        fractions, flows, sigmas = self._branches[True].columns
-        if not (flows > np.maximum(5 * sigmas, 0.1 * abs(self.fit.leak_um_per_s))).any():
-            raise ValueError(
-                f"the mirror moves alike at every command ({flows[-1]:.2f} +- {sigmas[-1]:.2f} um/s more at "
-                f"{fractions[-1]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
-                "`tune pump` again"
-            )
-        known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
-        top = int(np.flatnonzero(known)[-1]) + 1  # no command beyond is given
-        leak, full = self.fit.leak_um_per_s, float(flows[top - 1])
-        if not known[:top].all() or (top < known.size and full < _REACHES_LEAKS * leak):
-            raise ValueError(
-                f"the flow at {fractions[~known][0]:.2f} is known to {sigmas[~known][0]:.2f} um/s only after "
-                f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
-                "or in steadier weather"
-            )
-        fractions, flows, sigmas = fractions[:top], flows[:top], sigmas[:top]
+        rising, from_bottom = self._known_part()
+        leak, full = self.fit.leak_um_per_s, float(rising.flows[-1])
         if full < leak:
             raise ValueError(
                 f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
                 "take a stronger pump, then run `tune pump` again"
             )
-        start, above = self.start(), self._branches[False].columns
-        begin, stall = 0.0, 0.0
+        start, above = _jump(rising, full), self._branches[False].columns
+        begin = stall = 0.0 if from_bottom else float(rising.fractions[0])
         if start is not None:
             begin = stall = start[1]
-            stalls = _jump(above[0], above[1], full)
+            stalls = _jump(self._branches[False], full)
             stall = min(begin, stalls[1]) if stalls is not None else begin
         falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
-        rising = {f: v for f, v in zip(fractions.tolist(), flows.tolist(), strict=True) if f >= begin}
-        points = sorted({**falling, **rising}.items())
+        up = {f: v for f, v in zip(rising.fractions.tolist(), rising.flows.tolist(), strict=True) if f >= begin}
+        points = sorted({**falling, **up}.items())
         while len(points) > 2 and points[1][1] <= 0.005 * full:
             points.pop(0)
         while len(points) > 2 and points[-2][1] >= 0.995 * full:
@@ -352,18 +330,65 @@ class PumpSurvey:
             table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
         pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
         return PumpMap(
-            _tuple(fractions), _tuple(flows), _tuple(sigmas), pump, leak, self.fit.delay_s, self.fit.lag_s,
+            *(_tuple(column) for column in rising.columns), pump, leak, self.fit.delay_s, self.fit.lag_s,
             self.duration_s, self.done,
         )  # fmt: skip
 
+    def _known_part(self) -> tuple[Branch, bool]:
+        """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
 
-def _jump(fractions: FloatArray, flows: FloatArray, full: float) -> tuple[float, float] | None:
-    """Commands just below and at the first flow, if that is a jump."""
-    for (low, high), (before, after) in zip(pairwise(fractions.tolist()), pairwise(flows.tolist()), strict=True):
-        if before < 0.02 * full <= after:
-            steep = after > _JUMP_SHARE * full and high - low <= _EDGE_MOST
-            return (low, high) if steep else None
-    return None
+        Beyond them nothing is said. Raises ValueError if there are none.
+        """
+        if not self.fit.levels:
+            raise ValueError(
+                "the experiments were stopped too early: run `tune pump` again in steadier weather, or with a larger "
+                "--limit-um"
+            )
+        fractions, flows, sigmas = self._branches[True].columns
+        leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
+        if (flows[1:] + 3 * sigmas[1:] < _STUCK_LEAKS * leak).all():
+            raise ValueError(
+                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} um/s more at "
+                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
+                "`tune pump` again"
+            )
+        known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
+        low = top = int(np.argmin(np.where(known, np.abs(flows - _REACHES_LEAKS * leak), np.inf)))
+        while low > 0 and known[low - 1]:
+            low -= 1
+        while top + 1 < known.size and known[top + 1]:
+            top += 1
+        if top == low or (top + 1 < known.size and flows[top] < _REACHES_LEAKS * leak):
+            unknown = min(top + 1, known.size - 1)
+            raise ValueError(
+                f"the flow at {fractions[unknown]:.2f} is known to {sigmas[unknown]:.2f} um/s only after "
+                f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
+                "or in steadier weather"
+            )
+        part = slice(low, top + 1)
+        return Branch(fractions[part], flows[part], sigmas[part]), low == 0
+
+
+def _jump(branch: Branch, full: float) -> tuple[float, float] | None:
+    """Commands just below and at the first clear flow, if that is a jump."""
+    fractions, flows, sigmas = branch.columns
+    clear = np.flatnonzero(flows - 2 * sigmas > _NONE_SHARE * full)
+    if not clear.size or not clear[0]:
+        return None
+    low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
+    return (low, high) if flows[clear[0]] > _JUMP_SHARE * full and high - low <= _EDGE_MOST else None
+
+
+def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
+    """By how much the flow may be off the straight line in each interval: the chords beside it, prolonged into it, meet.
+
+    There is no flow below the first command, and perhaps no more of it beyond the last.
+    """
+    widths = np.diff(fractions)
+    slopes = np.diff(flows) / widths
+    before, after = np.append(0.0, slopes[:-1]) - slopes, np.append(slopes[1:], 0.0) - slopes
+    across = np.where(before * after < 0, before * after, 0.0)
+    return np.abs(across * widths / np.where(across, before - after, 1.0))
 
 
 def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
