@@ -225,7 +225,16 @@ class Port:
             for number in (request.value, request.shape_time_constant_s, request.setpoint_step_um)
         )
         return commands.Command(
-            kind, peer.who, request.why, value, request.text, loop, experiment, next(self._numbers), shape_s, pump,
+            kind,
+            peer.who,
+            request.why,
+            value,
+            request.text,
+            loop,
+            experiment,
+            next(self._numbers),
+            shape_s,
+            pump,
             step_um,
         )
 

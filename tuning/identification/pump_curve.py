@@ -193,9 +193,7 @@ class _Mirror:
         flows = {level: FlowAt(*at) for level, *at in zip(levels, *columns, strict=True)}
         return PumpFit(flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, best.white)
 
-    def _gram(
-        self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None
-    ) -> tuple[FloatArray, float]:
+    def _gram(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None) -> tuple[FloatArray, float]:
         """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's determinant."""
         last = self._levels + np.arange(5)
         whole, determinant = np.zeros((self._levels + 5,) * 2), 0.0
@@ -259,9 +257,7 @@ def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
     return np.asarray(lfilter([1 - keep], [1, -keep], given - given[0], axis=0))
 
 
-def _whitened(
-    block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool
-) -> FloatArray:
+def _whitened(block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool) -> FloatArray:
     """Columns levels, before, leak, pressure, delay, lag, height, differenced so that the noise is white.
 
     Those of delay and lag say what a second more of them changes, with these flows of the levels and before.

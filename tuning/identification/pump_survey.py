@@ -330,8 +330,8 @@ class PumpSurvey:
             table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
         pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
         return PumpMap(
-            *(_tuple(column) for column in rising.columns), pump, leak, self.fit.delay_s, self.fit.lag_s,
-            self.duration_s, self.done,
+            _tuple(rising.fractions), _tuple(rising.flows), _tuple(rising.sigmas),
+            pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
         )  # fmt: skip
 
     def _known_part(self) -> tuple[Branch, bool]:
@@ -376,11 +376,12 @@ def _jump(branch: Branch, full: float) -> tuple[float, float] | None:
     if not clear.size or not clear[0]:
         return None
     low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
-    return (low, high) if flows[clear[0]] > _JUMP_SHARE * full and high - low <= _EDGE_MOST else None
+    before, after = flows[clear[0] - 1 : clear[0] + 1] / full
+    return (low, high) if before < _NONE_SHARE and after > _JUMP_SHARE and high - low <= _EDGE_MOST else None
 
 
 def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
-    """By how much the flow may be off the straight line in each interval: the chords beside it, prolonged into it, meet.
+    """By how much the flow may be off the straight line in each interval: where the chords beside it would meet.
 
     There is no flow below the first command, and perhaps no more of it beyond the last.
     """

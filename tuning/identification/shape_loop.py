@@ -102,7 +102,7 @@ class ShapeLoopFit:
 def step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
     """Hold low, high, low with the shape loop off; return the shapes of each level.
 
-    Each level is a trial, after which the hold itself restores setpoint and shape loop, whatever became of the session.
+    Each level is a trial, after which the hold itself restores setpoint and shape loop.
     """
     levels: list[list[ShapeEstimate]] = []
     why = "shape loop: sag sensitivity"
