@@ -10,8 +10,9 @@ integral of the flow, so at the probe's frequency w, with the flow that the loop
 and s is the scale sought, whatever loop, weather and noise are. Doors and lifts do not know the signs. The delay d is
 assumed for an hour, then seen in the phase; the lag T is assumed: 0.15 s more of it read as 5 % less of s.
 
-s is a random walk; the error bar comes from the scatter of the segments. An offset of the curve and the film's leak
-are a constant flow each and cannot be told apart: the leak that is reported is their sum.
+s changes at a rate that wanders (without it the estimate trails a wearing pump by hours). The error bar comes from
+the scatter of the segments. An offset of the curve and the film's leak are a constant flow each and cannot be told apart:
+the leak that is reported is their sum.
 """
 
 import cmath
@@ -21,12 +22,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.control.filters import LowPass
-from membrane_ctrl.model.arrays import ComplexArray
+from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 PROBE_RAD_PER_S = 2 * math.pi / 5.0  # above the weather, below where the pump's lag matters
 SEGMENT_S = 60.0  # a whole number of periods
 _SETTLE_S = 10.0  # of a segment: the loop's answer to the change of sign
-WALK_PER_SQRT_S = 0.04 / 60.0  # of s: 4 % in an hour, so that 20 % in eight hours are followed
+WALK_PER_SQRT_S = 0.01 / 60.0  # of s: 1 % in an hour
+RATE_PER_S = 0.03 / 3600.0  # of s, as far as nobody knows: 20 % in eight hours are followed
+_RATE_LASTS_S = 4 * 3600.0
 SIGMA_FIRST = 0.2  # of a pump that nobody has measured
 _SEGMENTS = 60.0  # over which the scatter is taken
 _LEARNED = 5  # segments before the scatter means anything
@@ -35,6 +38,9 @@ _CLIP = 3.0  # standard deviations that a segment may be off: a gust
 RANGE = (0.5, 2.0)  # of the correction; beyond it the pump needs a person
 _RATE_PER_S = 0.05 / 3600.0  # of the correction
 _SURE = 2.0  # standard errors: less is noise, and not followed
+_KEEPS = math.exp(-SEGMENT_S / _RATE_LASTS_S)
+_PASSES = np.array([[1.0, SEGMENT_S], [0.0, _KEEPS]])  # of scale and rate, in a segment
+_WANDERS = np.diag([WALK_PER_SQRT_S**2 * SEGMENT_S, RATE_PER_S**2 * (1 - _KEEPS**2)])
 _SIGN_SEED = 0b1010_0110_1011_1001
 
 
@@ -69,7 +75,8 @@ class PumpDrift:
         self._mean_um, self._mean_flow = LowPass(SEGMENT_S), LowPass(SEGMENT_S)
         self._sums: ComplexArray = np.zeros(2, complex)  # of the segment: centre and flow
         self._means: ComplexArray = np.zeros(2, complex)  # of the segments: motion seen, and expected
-        self._variance = SIGMA_FIRST**2
+        self._rate_per_s = 0.0  # of the scale
+        self._spread: FloatArray = np.diag([SIGMA_FIRST**2, RATE_PER_S**2])  # covariance of scale and rate
         self._scatter = 0.0
         self._count = 0
 
@@ -113,17 +120,18 @@ class PumpDrift:
         size = abs(usual)
         if not size * abs(along):
             return
-        scale = self.known.scale
+        scale = self.known.scale + self._rate_per_s * SEGMENT_S
         off = (centre * along.conjugate()).real / abs(along) - scale * (expected * usual.conjugate()).real / size
         if self._count <= _LEARNED:
             self._scatter += share * (off**2 - self._scatter)
             return
-        spread = math.sqrt(self._scatter)
-        off = min(max(off, -_CLIP * spread), _CLIP * spread)
-        variance = min(self._variance + WALK_PER_SQRT_S**2 * SEGMENT_S, SIGMA_FIRST**2)
-        gain = variance * size / (self._scatter + variance * size**2)
-        self._variance = (1 - gain * size) * variance
-        self.known = PumpScale(scale + gain * off, math.hypot(math.sqrt(self._variance), _SIGMA_LEAST))
+        most = _CLIP * math.sqrt(self._scatter)
+        off = min(max(off, -most), most)
+        spread = _PASSES @ self._spread @ _PASSES.T + _WANDERS
+        gain = spread[0] * size / (self._scatter + spread[0, 0] * size**2)
+        self._spread = spread - np.outer(gain, spread[0]) * size
+        self._rate_per_s = _KEEPS * self._rate_per_s + float(gain[1]) * off
+        self.known = PumpScale(scale + float(gain[0]) * off, math.hypot(math.sqrt(self._spread[0, 0]), _SIGMA_LEAST))
         self._scatter += share * (off**2 - self._scatter)
 
     def _follow(self) -> None:

@@ -18,7 +18,7 @@ from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, Pum
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _USEFUL_SHARE = 0.02  # beyond it there is no curve
-_STUCK_LEAKS = 0.3  # a pump that surely gives less, at any command
+_STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
 _REACHES_LEAKS = 1.2
 _BENT_SHARE = 0.035  # of the full flow, by which a kink between two levels may be hidden
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
@@ -86,7 +86,7 @@ class PumpSurvey:
         self._share = min(1.0, self._share * (1.2 if completed else 0.8))
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
-        self.dark = self.dark + 1 if math.isnan(run.displacement_um[-1]) else 0
+        self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
         if self.runs:
             self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
             self._branches = {rising: self._branch(rising) for rising in (True, False)}
@@ -96,9 +96,9 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if not self._sure()[0].size:
-            if self._rounds >= _FIRST_ROUNDS:
+            if self._rounds >= (_FIRST_ROUNDS if self._stuck() else 3 * _FIRST_ROUNDS):
                 return ()
-            first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds))
+            first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
             rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
             pulses = [
                 (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s * self._share, rise_um), _for(0.0, 0.5))
@@ -334,6 +334,14 @@ class PumpSurvey:
             pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
         )  # fmt: skip
 
+    def _stuck(self) -> bool:
+        """Whether no command so far gives what would matter, beyond doubt."""
+        if not self.runs:
+            return False
+        _, flows, sigmas = (column[1:] for column in self._branches[True].columns)
+        # a pump that is stuck at what leaks makes the mirror look tight
+        return bool((flows + 3 * sigmas < max(_STUCK_LEAKS * self.fit.leak_um_per_s, _STUCK_UM_PER_S)).all())
+
     def _known_part(self) -> tuple[Branch, bool]:
         """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
 
@@ -346,7 +354,7 @@ class PumpSurvey:
             )
         fractions, flows, sigmas = self._branches[True].columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
-        if (flows[1:] + 3 * sigmas[1:] < _STUCK_LEAKS * leak).all():
+        if self._stuck():
             raise ValueError(
                 f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} um/s more at "
                 f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
