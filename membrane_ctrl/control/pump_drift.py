@@ -11,8 +11,8 @@ and s is the scale sought, whatever loop, weather and noise are. Doors and lifts
 assumed for an hour, then seen in the phase; the lag T is assumed: 0.15 s more of it read as 5 % less of s.
 
 s changes at a rate that wanders (without it the estimate trails a wearing pump by hours). The error bar comes from
-the scatter of the segments. An offset of the curve and the film's leak are a constant flow each and cannot be told apart:
-the leak that is reported is their sum.
+the scatter of the segments. An offset of the curve and the film's leak are a constant flow each and cannot be told
+apart: the leak that is reported is their sum.
 """
 
 import cmath

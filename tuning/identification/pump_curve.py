@@ -108,7 +108,7 @@ class _Blocks:
 
 
 @dataclass(frozen=True, slots=True)
-class _Solved:
+class _Flows:
     """The linear unknowns behind an actuator: flow of each level, leak, pressure, (what delay and lag are off)."""
 
     delay_s: float
@@ -163,7 +163,7 @@ class _Mirror:
         self._noise_um = float(np.median(np.abs(bends))) / 0.6745 / math.sqrt(6)
         self._rows = sum(block.displacement_um.size for block in blocks)
 
-    def solved(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None = None) -> _Solved:
+    def solved(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None = None) -> _Flows:
         """Flows behind an actuator; with `flows` also how far delay and lag are off, if those flowed."""
         gram, cost = self._gram(delay_s, lag_s, white, flows)
         here = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
@@ -172,9 +172,9 @@ class _Mirror:
         if flows is not None:
             gram[_OFF, _OFF] += self._noise_um**2 / _OFF_S**2
             _, values, covariance = _least_squares(gram, self._rows)
-        return _Solved(delay_s, lag_s, white, cost, values, covariance)
+        return _Flows(delay_s, lag_s, white, cost, values, covariance)
 
-    def improved(self, best: _Solved) -> _Solved:
+    def improved(self, best: _Flows) -> _Flows:
         """With a better delay and lag, if there are any."""
         off = self.solved(best.delay_s, best.lag_s, best.white, best.values).values[-2:]
         for share in (1.0, 0.4, 0.1):
@@ -184,7 +184,7 @@ class _Mirror:
                 return found
         return best
 
-    def fitted(self, best: _Solved, levels: Sequence[Level]) -> PumpFit:
+    def fitted(self, best: _Flows, levels: Sequence[Level]) -> PumpFit:
         """The flows of the levels, with the share of delay and lag in their errors."""
         found = self.solved(best.delay_s, best.lag_s, best.white, best.values)
         count = len(levels)
@@ -207,7 +207,7 @@ class _Mirror:
         return whole, determinant
 
 
-def _cost(found: _Solved) -> float:
+def _cost(found: _Flows) -> float:
     return found.cost
 
 
