@@ -175,7 +175,7 @@ class FilmHealth:
 
 
 _PUMP_EVERY = 10  # segments of a minute between reports
-_PUMP_SIGMAS = 2.5
+_PUMP_SIGMAS = 3.0
 
 
 class PumpHealth:

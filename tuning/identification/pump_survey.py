@@ -336,11 +336,10 @@ class PumpSurvey:
 
     def _stuck(self) -> bool:
         """Whether no command so far gives what would matter, beyond doubt."""
-        if not self.runs:
-            return False
-        _, flows, sigmas = (column[1:] for column in self._branches[True].columns)
         # a pump that is stuck at what leaks makes the mirror look tight
-        return bool((flows + 3 * sigmas < max(_STUCK_LEAKS * self.fit.leak_um_per_s, _STUCK_UM_PER_S)).all())
+        matters_um_per_s = max(_STUCK_LEAKS * self.fit.leak_um_per_s, _STUCK_UM_PER_S)
+        most = [at.flow_um_per_s + 3 * at.sigma_um_per_s for at in self.fit.levels.values()]
+        return bool(most) and max(most) < matters_um_per_s
 
     def _known_part(self) -> tuple[Branch, bool]:
         """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
