@@ -95,7 +95,7 @@ class PumpSurvey:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
-        if not self._sure()[0].size:
+        if not self._sure()[1].any():
             if self._rounds >= (_FIRST_ROUNDS if self._stuck() else 3 * _FIRST_ROUNDS):
                 return ()
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
@@ -118,8 +118,8 @@ class PumpSurvey:
 
     @property
     def full_um_per_s(self) -> float:
-        """The largest flow seen."""
-        return max((at.flow_um_per_s for at in self.fit.levels.values()), default=0.0)
+        """The largest flow seen for certain."""
+        return max([1e-3, *(at.flow_um_per_s - 2 * at.sigma_um_per_s for at in self.fit.levels.values())])
 
     @property
     def holding(self) -> float:
@@ -248,7 +248,7 @@ class PumpSurvey:
     def _guess(self, fraction: float) -> float:
         """Flow that a command may have, rather too large: beyond the largest known one like a square."""
         fractions, flows = (np.append(0.0, column) for column in self._sure())
-        if fraction <= fractions[-1]:
+        if fraction <= fractions[-1] or not flows[-1]:
             return float(np.interp(fraction, fractions, flows))
         none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
         return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
@@ -338,8 +338,10 @@ class PumpSurvey:
         """Whether no command so far gives what would matter, beyond doubt."""
         # a pump that is stuck at what leaks makes the mirror look tight
         matters_um_per_s = max(_STUCK_LEAKS * self.fit.leak_um_per_s, _STUCK_UM_PER_S)
-        most = [at.flow_um_per_s + 3 * at.sigma_um_per_s for at in self.fit.levels.values()]
-        return bool(most) and max(most) < matters_um_per_s
+        if not self.runs or any(at.flow_um_per_s > 5 * at.sigma_um_per_s for at in self.fit.levels.values()):
+            return False
+        _, flows, sigmas = (column[1:] for column in self._branches[True].columns)
+        return bool((flows + 3 * sigmas < matters_um_per_s).all())
 
     def _known_part(self) -> tuple[Branch, bool]:
         """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
