@@ -88,7 +88,7 @@ class PumpSurvey:
             self.runs.append(run)
         self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
         if self.runs:
-            self.fit = fit(self.runs, self.fit if self._rounds > 3 else None)
+            self.fit = fit(self.runs, self.fit if self._rounds > 3 and self.fit.levels else None)
             self._branches = {rising: self._branch(rising) for rising in (True, False)}
 
     def steps(self) -> tuple[PumpStep, ...]:
