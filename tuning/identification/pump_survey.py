@@ -367,10 +367,9 @@ class PumpSurvey:
             low -= 1
         while top + 1 < known.size and known[top + 1]:
             top += 1
-        if top == low or (top + 1 < known.size and flows[top] < _REACHES_LEAKS * leak):
-            unknown = min(top + 1, known.size - 1)
+        if top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak):
             raise ValueError(
-                f"the flow at {fractions[unknown]:.2f} is known to {sigmas[unknown]:.2f} um/s only after "
+                f"the flow beyond a command of {fractions[top]:.2f} is not known to {_USEFUL_SHARE:.0%} after "
                 f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
                 "or in steadier weather"
             )
