@@ -32,13 +32,13 @@ from membrane_ctrl.config.optics import (
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
 from membrane_ctrl.metrology.checked import RejectedSetError, check
+from membrane_ctrl.metrology.consistency import Examined, examine
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import LASER_NOISE_UM, FullResult, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
-from membrane_ctrl.metrology.witnesses import Examined, examine
 from membrane_ctrl.model.shape_estimate import judge
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film

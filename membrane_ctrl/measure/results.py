@@ -15,7 +15,7 @@ import numpy as np
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
-from membrane_ctrl.metrology import bins, witnesses
+from membrane_ctrl.metrology import bins, consistency
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
@@ -71,7 +71,7 @@ def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline
     """Error bars of a measurement; None if it has no figure.
 
     Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to propagate.
-    `geometry` is the file with the covariance, `outline` the rim in the picture, a witness of the geometry.
+    `geometry` is the file with the covariance, `outline` the rim in the picture, which checks the geometry.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:
@@ -79,7 +79,7 @@ def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline
     spread, source = spread_of(optics, geometry)
     noise_adu = float(np.nanmax([bins.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]))
     try:
-        seen = witnesses.examine(optics, checked, full, spread, noise_adu, outline)
+        seen = consistency.examine(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
         raise errors.InputError(f"{source}: too wide: the figure does not follow from such a geometry") from None
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)

@@ -15,12 +15,12 @@ from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, Geometry
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
 from membrane_ctrl.metrology.checked import check
+from membrane_ctrl.metrology.consistency import Examined, examine
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
-from membrane_ctrl.metrology.witnesses import Examined, examine
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence

@@ -25,7 +25,7 @@ from membrane_ctrl.model.arrays import FloatArray
 
 RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
-# The film as the geometry's witness. Its round terms beyond the 36 are a micrometre of a 37 mm bowl, and a nanometre
+# The film as a check of the geometry. Its round terms beyond the 36 are a micrometre of a 37 mm bowl, and a nanometre
 # of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever slackness
 # the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]

@@ -152,7 +152,7 @@ class Tracker:
         time_s : float
             Middle of the exposure.
         displacement_um : float
-            Laser reading then, a witness; NaN without.
+            Laser reading then, a check; NaN without.
 
         Raises ValueError for a frame of wrong size or type.
         """
