@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
@@ -207,7 +208,7 @@ def write_json(path: Path, table: dict[str, Any]) -> None:
     write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
 
 
-def write_arrays(path: Path, **arrays: FloatArray) -> None:
+def write_arrays(path: Path, **arrays: NDArray[Any]) -> None:
     """Write an `.npz`. Raises OSError."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)

@@ -1,6 +1,5 @@
 """The `track` command: the figure of every frame of a crossed pattern (docs/interfaces.md, section 3b)."""
 
-import io
 import json
 import math
 import sys
@@ -20,6 +19,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import GeometryFile, read_geometry
 from membrane_ctrl.measure.capture_set import read_image, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
+from membrane_ctrl.measure.results import write_arrays, write_figure
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, separable
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
@@ -102,7 +102,7 @@ def track_command(options: TrackOptions) -> int:
     table = _table(track)
     with errors.writing(out):
         files.make_folder(out)
-        _write_columns(out / "track.npz", track)
+        write_arrays(out / "track.npz", **track.columns())
         if options.pictures:
             _show(out, track, _lines(table))
     rate = len(track.frames) / passed_s
@@ -206,12 +206,6 @@ def _pictures(content: TrackFile, folder: Path, size: tuple[int, int], depth: np
         yield picture
 
 
-def _write_columns(path: Path, track: Track) -> None:
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **track.columns())
-    files.write_bytes_atomic(path, file.getvalue())
-
-
 def _table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
@@ -278,7 +272,6 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
 def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray) -> Path:
     """Draw the terms over time, the sag with its band, and what the fits left."""
     from membrane_ctrl.measure.pictures import sheet
-    from membrane_ctrl.measure.results import write_figure
 
     figure, (terms, sag, left) = sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)

@@ -85,10 +85,10 @@ class SimulationSpec:
     film: film_shape.FilmShape  # its sag belongs to displacement 0
     # 18 frames (for four steps), the sinusoids alone, or the sinusoids of several periods
     kind: Literal["full", "fringes", "frequencies"] = "full"
-    coarser_mm: tuple[float, ...] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
     reference: str = ""  # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
     # one phase shift a step, written into each frame; empty: 2 pi k / N, not written
     shifts_rad: tuple[float, ...] = ()
+    coarser_mm: tuple[float, ...] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
     motion: Motion = Motion()  # of the film on the run's clock
     displacements_um: tuple[float, ...] = ()  # instead of `motion`: one a frame, in the order of `patterns`
     start_s: float = 0.0  # start of the first exposure on the run's clock

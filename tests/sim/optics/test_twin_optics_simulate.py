@@ -194,7 +194,7 @@ def test_the_same_seed_writes_the_same_set(tmp_path: Path, small_optics: OpticsC
         ({"frame_interval_s": -1.0}, "frame_interval_s = -1.0 must be 0 or more"),
         ({"laser_noise_um": float("inf")}, "laser_noise_um = inf"),
         ({"seed": -1}, "seed = -1"),
-        ({"kind": "half"}, "kind = 'half' must be full or fringes"),
+        ({"kind": "half"}, "kind = 'half' must be full, fringes or frequencies"),
         ({"faults": (FrameFault("dark", "z_sin_0"),)}, "faults: no frame 'z_sin_0'"),
         ({"faults": (FrameFault("stale", "x_sin_0"),)}, "faults: x_sin_0 has no neighbour"),
         ({"faults": (FrameFault("swapped", "black"),)}, "faults: black has no neighbour"),
