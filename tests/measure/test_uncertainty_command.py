@@ -163,6 +163,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return _Client.addresses
 
 
+@pytest.mark.campaign
 def test_on_a_cluster(analysed: Callable[..., dict[str, Any]], cluster: list[str]) -> None:
     here = analysed("--trials", "110")
     there = analysed("--trials", "110", "--scheduler", "tcp://host:8786")

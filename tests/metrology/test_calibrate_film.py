@@ -28,6 +28,7 @@ def solved(truth: Truth, film: FilmModel, rim: Rim | None = None) -> Solution:
     return solve(replace(problem, references=replace(problem.references, film=film), rim=rim))
 
 
+@pytest.mark.campaign
 def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
     truth = make(VALUES, 4, points=600, prestrain=1e-3, poisson=0.35)
     (finding,) = after(solved(truth, "hencky"))
@@ -41,6 +42,7 @@ def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
     assert figure_um < 3 * claim.figure_rms_um
 
 
+@pytest.mark.campaign
 def test_the_terms_beyond_follow_the_excess_of_any_film_of_the_law() -> None:
     """Against the twin's films."""
     for prestrain, poisson in ((0.0, 0.3), (1e-3, 0.36), (2e-4, 0.42)):

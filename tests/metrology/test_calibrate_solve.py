@@ -84,6 +84,7 @@ def test_a_bow_is_solved_when_it_is_free() -> None:
     assert rms([sag for sag, _ in errors]) < 9
 
 
+@pytest.mark.campaign
 def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
     values = drawn(5)
     many = make(values, 5, points=40_000)

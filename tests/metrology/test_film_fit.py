@@ -93,6 +93,7 @@ def test_without_a_gauge_the_stiffness_is_unknown_and_the_rest_is_not() -> None:
     assert fit.sigmas[2] > 10
 
 
+@pytest.mark.campaign
 def test_what_no_law_explains_widens_the_bars() -> None:
     """Micrometres of figure in all sets, ten times those of a clean film, and of another law."""
     for seed, world in ((3, World(figure_mm=2e-3)), (4, World(figure_mm=1e-3, follows_mm=3e-3))):

@@ -86,6 +86,7 @@ def test_figure_of_a_moving_film() -> None:
     assert errors[False] > 3 * errors[True]
 
 
+@pytest.mark.campaign
 def test_noise_is_that_of_whole_measurements() -> None:
     """Variances of the 36 parameters over 24 sets with new pixel noise, against those of 600 trials."""
     anchor = _first()[0].anchor()
@@ -141,6 +142,7 @@ def test_linear_covariance_is_the_monte_carlo_within_ten_per_cent() -> None:
     assert np.abs(MAP.sigma(noise_covariance(trial))[seen] / noise[seen] - 1).max() < 0.1
 
 
+@pytest.mark.campaign
 def test_the_papers_figures() -> None:
     """Absolute: the largest is the paper's 50 um, the mean half of its 24.8. Pairs: geometry cancels (docs)."""
     sets = [_bench(), _bench(20.0)]

@@ -90,6 +90,7 @@ def test_full_flow_lifts_the_centre_by_the_configured_speed() -> None:
     assert plant.truth().pump_um_per_s == pytest.approx(4.0, rel=2e-3)
 
 
+@pytest.mark.campaign
 def test_filling_from_flat_takes_two_hours() -> None:
     plant = Plant(TwinConfig(scenario="calm", from_flat=True, leak_time_constant_s=1e8), PumpConfig())
     assert plant.truth().sag_mm == 0.0

@@ -164,6 +164,7 @@ def flat_map(pump: PumpConfig) -> PumpMap:
 
 
 @pytest.mark.parametrize("strength", [1.0, 2.0])
+@pytest.mark.campaign
 def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strength: float
 ) -> None:

@@ -33,6 +33,7 @@ def still_held(link: TwinHold) -> bool:
     return link.rows[-1].state == State.HOLD and all(abs(row.truth_displacement_um) < 2.0 for row in link.rows[-250:])
 
 
+@pytest.mark.campaign
 def test_a_door_in_the_first_relay_costs_that_relay_only() -> None:
     link, rig = held([AmbientChange(120.0, -20.0)])
     done = characterise(rig)
@@ -42,6 +43,7 @@ def test_a_door_in_the_first_relay_costs_that_relay_only() -> None:
     assert still_held(link)
 
 
+@pytest.mark.campaign
 def test_a_lost_laser_ends_the_relay_by_name() -> None:
     link, rig = held()
     rig.hold(20.0)
