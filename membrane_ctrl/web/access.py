@@ -305,9 +305,14 @@ ACTIONS = (
 )
 
 
+def outranks(role: str, needed: Role) -> bool:
+    """Whether a role includes the needed one; an unknown role is `read`."""
+    return _RANK.get(role, 0) >= _RANK[needed]
+
+
 def may(user: WebUser, port_role: str, action: Action) -> bool:
     """Whether the viewer's role and that of this process at the port both allow it."""
-    return min(_RANK[user.role], _RANK.get(port_role, 0)) >= _RANK[action.role]
+    return outranks(user.role, action.role) and outranks(port_role, action.role)
 
 
 def request(action: Action, user: WebUser, given: str, take_over: bool = False) -> dict[str, Any]:

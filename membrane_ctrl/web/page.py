@@ -58,7 +58,7 @@ class WebPage:
             with ui.tab_panel(now):
                 self._build_now()
             with ui.tab_panel(look_back):
-                runs_panel(self._logs, lambda: self._utc)
+                runs_panel(self._logs, self._user, lambda: self._utc)
             with ui.tab_panel(tune):
                 tuning_panel(self._logs)
         ui.keyboard(on_key=self._key)

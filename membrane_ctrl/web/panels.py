@@ -17,11 +17,12 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import LiveReader
+from membrane_ctrl.web.access import WebUser, outranks
 from membrane_ctrl.web.figures import sparkline
 
 _POINTS = 80
 _MOST = 200  # runs in the table, newest first
-_REPORT = "report.html"
+REPORT = "report.html"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,21 @@ def _picture(folder: Path, ended: float | bool) -> str:
     return sparkline(values)
 
 
-def runs_panel(logs: Path, utc: Callable[[], bool]) -> None:
+def run_folder(logs: Path, name: str) -> Path | None:
+    """The folder of a run in `logs`; None for what is not a name: it comes from a browser."""
+    return logs / name if name and name == Path(name).name and not name.startswith(".") else None
+
+
+def report_problem(folder: Path, user: WebUser) -> str:
+    """Write the run's report if there is none; returns why there is none, or an empty text."""
+    if (folder / REPORT).exists():
+        return ""
+    if not outranks(user.role, "operate"):
+        return f"{folder.name}: no report yet; writing one needs the role operate"
+    return _command("report", str(folder))
+
+
+def runs_panel(logs: Path, user: WebUser, utc: Callable[[], bool]) -> None:
     """Fill the tab."""
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
@@ -73,18 +88,17 @@ def runs_panel(logs: Path, utc: Callable[[], bool]) -> None:
         if not table.selected:
             ui.notify("Select a run first.")
             return None
-        return logs / str(table.selected[0]["run"])
+        return run_folder(logs, str(table.selected[0]["run"]))
 
     async def report() -> None:
         folder = chosen()
         if folder is None:
             return
-        if not (folder / _REPORT).exists():
+        if not (folder / REPORT).exists():
             ui.notify("Writing the report.")
-            said = await asyncio.to_thread(_command, "report", str(folder))
-            if said:
-                ui.notify(said, type="negative", timeout=10_000)
-                return
+        if said := await asyncio.to_thread(report_problem, folder, user):
+            ui.notify(said, type="negative", timeout=10_000)
+            return
         ui.navigate.to(f"/report/{folder.name}", new_tab=True)
 
     async def review() -> None:

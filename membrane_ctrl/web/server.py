@@ -13,6 +13,7 @@ from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
 from membrane_ctrl.web.feed import HoldFeed
 from membrane_ctrl.web.page import WebPage
+from membrane_ctrl.web.panels import REPORT, run_folder
 
 _LOCAL = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_BYTES_MAX = 64_000_000
@@ -87,11 +88,11 @@ def serve(options: WebOptions) -> None:
 
 def report_page(logs: Path, name: str) -> HTMLResponse:
     """A run's report, in a sandbox: a run folder may come from anywhere."""
-    folder = logs / name
-    if not name or name != Path(name).name or name.startswith("."):
+    folder = run_folder(logs, name)
+    if folder is None:
         return HTMLResponse("no such run", 404)
     try:
-        text = files.read_bytes(folder / "report.html", _REPORT_BYTES_MAX).decode("utf-8", "replace")
+        text = files.read_bytes(folder / REPORT, _REPORT_BYTES_MAX).decode("utf-8", "replace")
     except OSError:
         return HTMLResponse("no report yet", 404)
     sandbox = "sandbox allow-scripts; default-src 'unsafe-inline' data:"

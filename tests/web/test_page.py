@@ -15,7 +15,8 @@ import pytest
 
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.web import server
+from membrane_ctrl.web import panels, server
+from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import CHROMIUM, Tab, browser_tab
 
@@ -115,3 +116,20 @@ def test_a_report_of_a_stranger_runs_in_a_sandbox(tmp_path: Path) -> None:
     assert policy.startswith("sandbox")
     assert "allow-same-origin" not in policy
     assert server.report_page(tmp_path, "none").status_code == 404
+
+
+def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[tuple[str, ...]] = []
+    monkeypatch.setattr(panels, "_command", lambda *words: started.append(words) or "")
+    run = tmp_path / "run"
+    run.mkdir()
+    reader, operator = WebUser("bob", "read"), WebUser("anna", "operate")
+    assert "needs the role operate" in panels.report_problem(run, reader)
+    assert started == []
+    assert panels.report_problem(run, operator) == ""
+    assert started == [("report", str(run))]
+    (run / panels.REPORT).write_text("written")
+    assert panels.report_problem(run, reader) == "", "what exists may be read"
+    assert len(started) == 1
+    assert panels.run_folder(tmp_path, "run") == run
+    assert [panels.run_folder(tmp_path, name) for name in ("../run", "/etc", "..", "", "a/b", ".x")] == [None] * 6
