@@ -116,7 +116,7 @@ def outer(options: TuneOptions) -> int:
     from tuning.identification import shape_loop
 
     assumed = zernike_projection()
-    with opening.opened(options) as (folder, rig, progress):
+    with opening.opened(options, again="run `membrane-ctrl tune outer` again") as (folder, rig, progress):
         before_s = folder.config.shape.time_constant_s
         progress.begin("shape loop", shape_loop.TYPICAL_S + options.observe_s, options.verify_s)
         rig.hold(options.observe_s)

@@ -67,8 +67,10 @@ def author_name() -> str:
 
 
 @contextlib.contextmanager
-def opened(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Yield a session's folder and hold; restore the last good gains if it ends early."""
+def opened(
+    options: TuneOptions, fresh: bool = False, again: str = "resume it with `membrane-ctrl tune run --resume {}`"
+) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
+    """Yield a session's folder and hold; restore the last good gains if it ends early, and say how to go on."""
     progress = Progress()
     with linked(options) as link:
         folder = folder_of(options, link, fresh)
@@ -85,7 +87,7 @@ def opened(options: TuneOptions, fresh: bool = False) -> Iterator[tuple[SessionF
             except BaseException as error:
                 _go_back(rig, progress)
                 progress.note("ended", str(error) or "interrupted")
-                progress.say(f"resume it with `membrane-ctrl tune run --resume {folder.path}`")
+                progress.say(again.format(folder.path))
                 if isinstance(error, HoldError):
                     raise DeviceError(str(error)) from None
                 raise

@@ -80,7 +80,10 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
     holding = curve.fraction(around.holding_flow_um_per_s)
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     while steps := survey.steps():
-        around = replace(around, holding_flow_um_per_s=curve.flow(survey.holding))
+        flow_um_per_s = (
+            curve.flow(survey.holding) or around.holding_flow_um_per_s
+        )  # none, on a curve far from the true
+        around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         survey.take(run_of(rows, rig.dt_s), finished.completed)

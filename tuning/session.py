@@ -82,11 +82,17 @@ class PumpUnknownError(errors.RejectedError):
 def characterise_step(
     session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0, plan: characterise.Plan = characterise.FULL
 ) -> characterise.Experiments:
-    """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes."""
+    """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes.
+
+    It is a PumpUnknownError if the pump's curve may be the cause.
+    """
     session.begin("characterise")
     try:
         done = characterise.experiment(rig, limit_um, plan)
-    except (characterise.ExperimentError, ValueError) as error:
+    except characterise.ExperimentError as error:
+        kind = PumpUnknownError if characterise.MAP_THE_PUMP in str(error) else errors.RejectedError
+        raise kind(f"characterise: {error}") from None
+    except ValueError as error:
         raise PumpUnknownError(f"characterise: {error}") from None
     records.save_record(session.file("experiments.npz"), done.record)
     if plan is characterise.SHORT and done.held is not None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.model.errors import RejectedError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model.errors import Exit, RejectedError
+from membrane_ctrl.model.states import ShapeState, State
 from membrane_ctrl.sessions.folder import create_session
-from membrane_ctrl.sessions.live_hold import HoldError
+from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.plant import BenchEvent
-from tuning import session
-from tuning.identification.characterise import characterise, spec_of
+from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tuning import opening, session
+from tuning.identification import shape_loop
+from tuning.identification.characterise import ExperimentError, characterise, spec_of
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig
 
@@ -93,3 +99,93 @@ def test_a_refused_command_is_an_error_with_the_reason() -> None:
     _, rig = held()
     with pytest.raises(HoldError, match="outside the limits"):
         rig.set_gains(rig.loop, "test", 5.0, setpoint_step_um=5000.0)
+
+
+class Outer(TwinHold):
+    """What `tune outer` works on: the connection is lost, or Ctrl-C comes, a time after a trial begins."""
+
+    last: Outer
+    when = (0, 0.0)  # trials before it, seconds after its begin
+    lost = False  # the connection; else Ctrl-C
+
+    def __init__(self, *given: object) -> None:
+        super().__init__(*given)  # type: ignore[arg-type]
+        Outer.last, self.trials, self.begun_s, self.gone = self, 0, math.inf, False
+
+    def ask(self, command: Command) -> None:
+        """Counts the trials of the session."""
+        if self.gone and self.lost:
+            raise HoldError("the connection is lost")
+        super().ask(command)
+        self.trials += math.isfinite(command.value)
+        if self.trials > self.when[0]:
+            self.begun_s = min(self.begun_s, self.rows[-1].mono_s)
+
+    def news(self) -> News:
+        """No more of them once the connection is lost."""
+        if not self.gone and self.rows[-1].mono_s > self.begun_s + self.when[1]:
+            self.gone = True
+            if not self.lost:
+                signal.raise_signal(signal.SIGINT)
+        if self.gone and self.lost:
+            raise HoldError("the connection is lost")
+        return super().news()
+
+    def close(self) -> None:
+        """The hold outlives its session."""
+
+
+@pytest.mark.parametrize(
+    ("when", "lost", "back_s"),
+    [((1, 20.0), False, 12.0), ((1, 20.0), True, 45.0), ((3, 5.0), False, 3.0), ((3, 5.0), True, 155.0)],
+    ids=["Ctrl-C, setpoint stepped", "lost, setpoint stepped", "Ctrl-C, on trial", "lost, on trial"],
+)
+def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: tuple[int, float], lost: bool, back_s: float
+) -> None:
+    monkeypatch.setattr(opening, "TwinHold", Outer)
+    monkeypatch.setattr(Outer, "when", when)
+    monkeypatch.setattr(Outer, "lost", lost)
+    monkeypatch.setattr(shape_loop, "_LEVEL_S", 20.0)
+    (tmp_path / "lab.toml").write_text("[loop]\nrate_hz = 10.0\n[twin]\nstart_error_um = -3.0\n")
+    words = ["--observe", "20s", "--verify", "30s", "--yes", "--config", f"{tmp_path}/lab.toml"]
+    code = run(["tune", "outer", "--twin", *words, "--logs", str(tmp_path)])
+    assert code == (Exit.DEVICE_FAILED if lost else Exit.INTERRUPTED)
+    hold = Outer.last
+    setpoint_um = hold.config.loop.setpoint_um
+    assert (abs(hold.rows[-1].setpoint_um - setpoint_um) > 4.0) == (when[0] == 1)
+    assert time_constant_s(hold) != hold.config.shape.time_constant_s or when[0] == 1
+    until_s = hold.rows[-1].mono_s + back_s
+    while hold.rows[-1].mono_s < until_s:
+        hold._advance(5)
+    assert hold.rows[-1].setpoint_um == pytest.approx(setpoint_um, abs=0.2)  # the shape loop trims it
+    assert time_constant_s(hold) == hold.config.shape.time_constant_s
+    assert hold.rows[-1].shape_state in (ShapeState.WAITING, ShapeState.TRACKING)
+
+
+def time_constant_s(hold: TwinHold) -> float:
+    """The shape loop's, now."""
+    return hold._run._supervisor._controller._shape._drift.memory_s
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(
+    ("pump", "at_most_s", "words"),
+    [
+        (ForeignPump("quadratic", 6.0, 1.0, 0.2, 0.22, 0.2), 200.0, "below the holding flow"),
+        (ForeignPump("root", 5.0, 0.2, 0.2), 200.0, "much stronger than configured"),
+    ],
+    ids=["bent", "too strong to complete a relay"],
+)
+def test_the_map_is_asked_for_by_the_first_relay_that_shows_the_need(
+    pump: ForeignPump, at_most_s: float, words: str
+) -> None:
+    link = TwinHold(foreign_config(rate_hz=20.0), bench=foreign_bench(ForeignPlant(pump, 4, 0.6, laser_um=0.5)))
+    rig, before_s = HoldRig(link, "tester"), link.rows[-1].mono_s
+    try:
+        said = "; ".join(characterise(rig).quality.reasons)
+    except ExperimentError as error:
+        said = str(error)
+    assert words in said
+    assert said.endswith("run `tune pump`")
+    assert link.rows[-1].mono_s - before_s < at_most_s

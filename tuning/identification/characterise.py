@@ -10,7 +10,7 @@ from tuning.identification.disturbance import SLOWEST_S
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
 from tuning.identification.records import Record
 
-_MAP_THE_PUMP = "run `tune pump`"
+MAP_THE_PUMP = "run `tune pump`"
 
 # Whether the data support a proposal; if not, the problem and the experiment that would help.
 
@@ -24,6 +24,7 @@ _P_MIN = 1e-4
 _BENT_SIGMAS = 5.0  # sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
 _BENT_SHARE = 0.2  # of k; the margins tolerate less
 _WORSE_MAX = 1.5  # innovation on new data relative to the fit
+_TOO_STRONG, _CERTAIN_SIGMAS = 1.25, 3.0  # k of a pump that stopped its relays
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class FitQuality:
     @property
     def pump_unknown(self) -> bool:
         """Refused because the pump is not what it is taken for."""
-        return self.verdict == "refused" and any(_MAP_THE_PUMP in reason for reason in self.reasons)
+        return self.verdict == "refused" and any(MAP_THE_PUMP in reason for reason in self.reasons)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +82,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"{record.lost_fraction:.0%} of the laser's readings were lost: check the laser, repeat")
     if model.gain < _UNANSWERED * sigma.gain:
         refused.append(
-            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {_MAP_THE_PUMP}"
+            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {MAP_THE_PUMP}"
         )
         return refused, degraded
     if identified.largest_residual > _JUMP_SIGMAS:
@@ -95,7 +96,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: repeat `tune characterise`")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {_MAP_THE_PUMP}")
+        degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {MAP_THE_PUMP}")
     if identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded
@@ -109,7 +110,7 @@ def _bent(record: Record, identified: Identified) -> list[str]:
         return []
     what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
     gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
-    return [f"{what} ({gains}): {_MAP_THE_PUMP}"]
+    return [f"{what} ({gains}): {MAP_THE_PUMP}"]
 
 
 _GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma
@@ -215,10 +216,11 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) ->
     around = rig.around(held, limit_um)
     machine.room(around)  # without room a relay would only report that it was stopped
     relays, finished = _relays(rig, around, plan)
-    gain = identify(relays).model.gain
+    found = identify(relays)
+    gain = found.model.gain
     whole = relays
     longest_s = (relays.duration_s, relays.duration_s)
-    for _ in range(plan.doublets):
+    for _ in range(0 if _bent(relays, found) else plan.doublets):
         latest, _ = rig.perform(spec_of("doublets", around, plan.doublets_s, gain))
         if latest.duration_s > longest_s[1] - longest_s[0]:
             longest_s = (whole.duration_s, whole.duration_s + latest.duration_s)
@@ -240,19 +242,37 @@ def fitted(done: Experiments) -> Characterised:
 
 
 def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Record, machine.Finished]:
-    """Relays until the gain is known, each followed by a hold."""
+    """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold."""
     done: Record | None = None
+    stopped: Record | None = None
     finished = machine.Finished(False, "")
     for _ in range(plan.relays):
         relay, finished = rig.perform(spec_of("relay", around, plan.relay_s))
-        between = rig.hold(_BETWEEN_S)
+        relay = relay.followed_by(rig.hold(_BETWEEN_S))
         if not finished.completed:
-            done = None
+            done, stopped = None, relay if stopped is None else stopped.followed_by(relay)
+            if finished.reason.startswith(machine.NO_ANSWER) or _too_strong(stopped):
+                break
             continue
-        done = relay.followed_by(between) if done is None else done.followed_by(relay, between)
+        done, stopped = relay if done is None else done.followed_by(relay), None
         found = identify(done)
-        if found.sigma.gain <= _GAIN_SIGMA * found.model.gain:
+        if found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found):
             break
     if done is None:
-        raise ExperimentError(finished.reason)
+        said = finished.reason
+        if said.startswith(machine.NO_ANSWER):
+            said += f"; if that is not the cause, {MAP_THE_PUMP}"
+        elif said.startswith(machine.STOPPED):
+            said += f": {MAP_THE_PUMP}"
+        raise ExperimentError(said)
     return done, finished
+
+
+def _too_strong(stopped: Record) -> bool:
+    """Whether the pump stopped these relays, and not the weather: the next one would end like them."""
+    try:
+        found = identify(stopped)
+    except ValueError:  # too short to tell
+        return False
+    stronger = found.model.gain - _CERTAIN_SIGMAS * found.sigma.gain > _TOO_STRONG
+    return stronger and found.largest_residual <= _JUMP_SIGMAS

@@ -79,7 +79,8 @@ _LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
 _LATE_S = 15.0  # that a level may take longer on a busy machine
 _LEAST_CYCLES = 8
-_SPARE_S, _BACK_S = 120.0, 1.0
+_SPARE_S = 120.0
+_BACK_S = 1.0  # a trial that is over at once: the hold takes its own time constant back
 # Below ten cycles it would follow the noise; beyond an hour the drift is unknown.
 _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 
@@ -190,7 +191,11 @@ def trial(
     why = "shape loop: time constant"
     rig.set_gains(rig.loop, why, duration_s + _SPARE_S, after_s)
     begun = len(rig.shapes)
-    rows = rig.ticks(duration_s)
+    try:
+        rows = rig.ticks(duration_s)
+    except BaseException:  # Ctrl-C above all
+        rig.set_gains(rig.loop, f"{why}: interrupted", _BACK_S)
+        raise
     during = [shape for shape in rig.shapes[begun:] if shape.verdict != "rejected"]
     tracking = float(np.mean([row.shape_state == ShapeState.TRACKING for row in rows]))
     gaps = _gaps([*earlier, *during], assumed)
@@ -201,7 +206,7 @@ def trial(
     elif error_um > GROWTH_MAX * error_before_um:
         reason = f"the next shape is predicted to {error_um:.2f} um, by the former one to {error_before_um:.2f} um"
     if reason:
-        rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)  # over at once: the hold takes its own one back
+        rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)
     else:
         rig.keep()
     return OuterTrial(before_s, after_s, error_before_um, error_um, tracking, reason)

@@ -27,6 +27,7 @@ class BenchSample:
 
 
 FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed, for a reading with little noise
+STOPPED = "stopped at"  # begins the reason of an experiment that the guard ended
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
 
@@ -149,7 +150,7 @@ class ExcursionGuard:
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
                 False,
-                f"stopped at {off_um:+.1f} um, moving at {self._motion.speed_um_per_s:+.1f} um/s: the limit of "
+                f"{STOPPED} {off_um:+.1f} um, moving at {self._motion.speed_um_per_s:+.1f} um/s: the limit of "
                 f"{self._limit_um:g} um was near; something else moved the mirror, or the pump is much stronger "
                 "than configured",
             )
@@ -257,6 +258,7 @@ _FIRST_MAX_UM_PER_S = 1.5
 _OVERSHOOT_LEAST_UM = 0.2  # smaller ones are noise
 # A half cycle of 5 um takes this long if leak + bleed are 0.06 um/s, where no mirror can be held.
 _PATIENCE_S = 90.0
+NO_ANSWER = "the mirror did not"  # begins the reason of a relay that waited in vain
 
 
 class Relay:
@@ -294,9 +296,7 @@ class Relay:
         elif self._since_switch_s > _PATIENCE_S:
             way = "rise" if self._direction > 0 else "sink"
             remedy = "check the pump, its tube and the leak" if self._direction > 0 else "open the bleed"
-            return Finished(
-                False, f"the mirror did not {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}"
-            )
+            return Finished(False, f"{NO_ANSWER} {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}")
         around = self._around
         swing = self._direction * self._amplitudes_um_per_s[self._direction]
         return around.within(around.holding_flow_um_per_s + swing)
