@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -55,9 +56,16 @@ FLOORS = {
 }
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """The file's syntax tree: a rule each asks for it."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports_of(path: Path) -> set[str]:
     """Every name that a file imports, in full, also inside functions."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     assert not any(isinstance(node, ast.ImportFrom) and node.level for node in ast.walk(tree)), (
         f"{path}: relative import"
     )
@@ -95,7 +103,7 @@ def test_a_circle_is_seen() -> None:
 
 
 def test_a_class_name_means_one_thing() -> None:
-    trees = (ast.parse(file.read_text(encoding="utf-8")) for file in files_of(*TOPS))
+    trees = (tree_of(file) for file in files_of(*TOPS))
     names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
 
@@ -146,7 +154,7 @@ def modules_reached(start: str) -> set[str]:
         if name in seen:
             continue
         seen.add(name)
-        top = ast.parse(known[name].path.read_text(encoding="utf-8")).body
+        top = tree_of(known[name].path).body
         plain = ast.Module([node for node in top if isinstance(node, ast.Import | ast.ImportFrom)], [])
         todo += [target for full in imported(plain) if (target := module_of(full, frozenset(known)))]
     return seen
@@ -178,12 +186,12 @@ RUNS_CODE = {"eval", "exec", "compile", "__import__", "execfile"}
 
 def unsafe(path: Path) -> set[str]:
     """Parts of a file that could run code from data."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     found = {module for module in imports_of(path) if module.split(".")[0] in MAKES_OBJECTS}
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
-        name = ast.unparse(node.func)
+        name = ast.unparse(node.func) if isinstance(node.func, ast.Name | ast.Attribute) else ""
         allows = [word for word in node.keywords if word.arg == "allow_pickle"]
         if name in RUNS_CODE or any(ast.unparse(word.value) != "False" for word in allows):
             found.add(ast.unparse(node))

@@ -16,7 +16,7 @@ from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.files import move, users, write_text_atomic
-from membrane_ctrl.sessions.folder import STEPS, SessionFolder
+from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder
 from tuning import gains_file, session
 from tuning.identification import disturbance, identify, loop_model, records
 from tuning.session import Design, Verified
@@ -160,21 +160,31 @@ def write_report(folder: SessionFolder) -> Path:
 
 
 def draw(folder: SessionFolder) -> None:
-    """Redraw the pictures of all finished steps."""
-    if folder.done("characterise"):
+    """Draw the pictures of the finished steps that are missing or older than what they show."""
+    if folder.done("characterise") and _outdated(folder, "experiments.png", "characterise", "identify"):
         found = session.found_of(folder).identified if folder.done("identify") else None
         draw_experiments(folder.file("experiments.png"), session.experiments_of(folder).record, found)
     if not folder.done("observe"):
         return
     model = session.found_of(folder).identified.model
     quiet = records.load_record(folder.file("quiet.npz"))
-    draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
-    if folder.done("design"):
+    if _outdated(folder, "weather.png", "identify", "observe"):
+        draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
+    if folder.done("design") and _outdated(folder, "candidates.png", "identify", "observe", "design"):
         draw_candidates(folder.file("candidates.png"), session.design_of(folder), model, quiet.dt_s)
-    if folder.done("verify"):
+    if folder.done("verify") and _outdated(folder, "verify.png", "identify", "observe", "verify"):
         path = folder.file("verify.npz")
         after = records.load_record(path) if path.exists() else None
         draw_verification(folder.file("verify.png"), quiet, after, model, session.verified_of(folder))
+
+
+def _outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
+    """Whether the picture is no file, or older than a result of one of the steps."""
+    path = folder.file(picture)
+    if path.is_symlink() or not path.is_file():
+        return True
+    results = [folder.file(name) for step in steps for name in FILES[step]]
+    return max(each.stat().st_mtime_ns for each in results if each.exists()) >= path.stat().st_mtime_ns
 
 
 def _identified(folder: SessionFolder) -> list[str]:

@@ -22,7 +22,7 @@ from membrane_ctrl.model.states import State
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, open_session
 from tuning import command as tune
 from tuning import gains_file as journal
-from tuning import session
+from tuning import report, session
 from tuning.choice import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
@@ -185,6 +185,34 @@ def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder)
     for word in ("ziegler-nichols", "eve", "Verification", "kept"):
         assert word in text
     assert done.file("session.rrd").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(
+    ("renewed", "drawn"),
+    [
+        (None, set()),
+        ("identified.json", {"experiments.png", "weather.png", "candidates.png", "verify.png"}),
+        ("quiet.npz", {"weather.png", "candidates.png", "verify.png"}),
+        ("gains.toml", {"candidates.png"}),
+        ("candidates.png", {"candidates.png"}),
+    ],
+)
+def test_a_picture_is_drawn_anew_when_what_it_shows_is(
+    done: SessionFolder, monkeypatch: pytest.MonkeyPatch, renewed: str | None, drawn: set[str]
+) -> None:
+    pictures = {"experiments.png", "weather.png", "candidates.png", "verify.png"}
+    for name in pictures:
+        os.utime(done.file(name), ns=(10**18, 2 * 10**18))
+    for path in set(done.path.iterdir()) - {done.file(name) for name in pictures}:
+        os.utime(path, ns=(10**18, 10**18))
+    if renewed in pictures:
+        done.file(renewed).unlink()
+    elif renewed is not None:
+        os.utime(done.file(renewed), ns=(10**18, 2 * 10**18))  # at the same moment: which was first is not known
+    seen: set[str] = set()
+    monkeypatch.setattr(report, "_save", lambda path, figure: seen.add(path.name))
+    report.draw(done)
+    assert seen == drawn
 
 
 def test_calculating_steps_can_be_repeated_without_a_hold(done: SessionFolder) -> None:

@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeo
 from membrane_ctrl.metrology.optics import compiled, film_law, kernels, screen_face, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Small matrix products as plain loops.
@@ -112,8 +112,8 @@ def place_rays(bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex
     """The set's rays, followed to the surface."""
     points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
-    tracer.start(points, surface.height)
-    tracer.intersect(points, surface, newton=3)
+    tracer.start(points, parabola(surface.sag_mm, surface.radius_mm))
+    tracer.intersect(points, surface, newton=4)  # from some mm: 0.1 mm, 1 nm, 1e-16 mm
     return points
 
 

@@ -21,7 +21,7 @@ from membrane_ctrl.metrology.orders import gray_bit
 from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
-_SAMPLE = 20_000
+_SAMPLE = 6_000
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
 _EDGE_RAD = 0.5
 
