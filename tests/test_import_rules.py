@@ -52,7 +52,7 @@ FLOORS = {
         "membrane_ctrl/review",
     },
     8: {"membrane_ctrl/cli", "membrane_ctrl/web", "tuning"},
-    9: {"membrane_ctrl/__main__"},
+    9: {"membrane_ctrl/__main__", "membrane_ctrl/doors"},
 }
 
 

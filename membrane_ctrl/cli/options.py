@@ -50,7 +50,10 @@ def configured(path: Path | None) -> "Config":
         tls = _beside(port.tls, folder, "certificate_file", "key_file", "client_ca_file")
         port = port.model_copy(update={"tls": tls})
     alarms = _beside(alarms, folder, "urls_file", "escalation_urls_file")
-    return config.model_copy(update={"optics": optics, "port": port, "alarms": alarms})
+    doors = config.doors
+    if doors.mqtt is not None:
+        doors = doors.model_copy(update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")})
+    return config.model_copy(update={"optics": optics, "port": port, "alarms": alarms, "doors": doors})
 
 
 def _beside(section: S, folder: Path, *names: str) -> S:

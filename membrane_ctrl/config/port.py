@@ -1,4 +1,4 @@
-"""Configuration of the control port and of the alarms."""
+"""Configuration of the control port, of the doors for other systems, and of the alarms."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,6 +9,8 @@ from firmware_iface.settings import Section
 from membrane_ctrl.model.telemetry import FIELDS
 
 SOCKET_NAME = "control.sock"
+LOCAL = "127.0.0.1"
+LOCAL_HOSTS = frozenset({LOCAL, "localhost", "::1"})
 Seconds = Annotated[float, Field(ge=0, le=1e6)]
 Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
 
@@ -48,6 +50,67 @@ class PortConfig(Section):
     def socket_in(self, logs_dir: Path) -> Path:
         """The socket's file of a hold with its runs in `logs_dir`."""
         return Path(self.socket) if self.socket else logs_dir / SOCKET_NAME
+
+
+class MqttConfig(Section):
+    """The broker that gets the published values."""
+
+    host: str = "127.0.0.1"
+    """Host of the broker. Set it to your broker's."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    """TCP port of the broker. Change it to your broker's; with TLS usually 8883."""
+    username: str | None = None
+    """Name at the broker. Set it if the broker asks for one."""
+    password_file: str | None = None
+    """File with the password alone, which no run copies. Set it with `username`."""
+    ca_file: str | None = None
+    """CA of the broker's certificate; with it the connection is TLS. Set it for a broker on another machine."""
+    discovery_prefix: str = "homeassistant"
+    """Prefix of Home Assistant's discovery; empty: none. Leave it, unless Home Assistant's was changed."""
+
+
+class OpcuaConfig(Section):
+    """The OPC UA server."""
+
+    host: str = LOCAL
+    """Address to listen on. Change it to let other machines connect."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 4840
+    """TCP port. Change it if another program has it."""
+
+
+class EpicsConfig(Section):
+    """The EPICS server, Channel Access and PV Access."""
+
+    host: str = LOCAL
+    """Address to listen on. Change it to let other machines connect."""
+    ca_port: Annotated[int, Field(ge=1024, le=65535)] = 5064
+    """Port of Channel Access. Change it if another server has it."""
+    pva_port: Annotated[int, Field(ge=1024, le=65535)] = 5075
+    """Port of PV Access. Change it if another server has it."""
+
+
+class DoorsConfig(Section):
+    """Doors for the lab's other systems (docs/doors.md), opened by `membrane-ctrl doors`."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "mirror"
+    """First part of every published name. Change it where there are several mirrors."""
+    role: Literal["read", "operate", "tune"] = "read"
+    """What may be asked through the doors at most. Change it to let other systems act."""
+    period_s: Annotated[float, Field(ge=0.5, le=60)] = 1.0
+    """Interval between values. Raise it for a slow network."""
+    mqtt: MqttConfig | None = None
+    opcua: OpcuaConfig | None = None
+    epics: EpicsConfig | None = None
+
+    @model_validator(mode="after")
+    def _only_people_we_know_act(self) -> "DoorsConfig":
+        for name, door in (("opcua", self.opcua), ("epics", self.epics)):
+            if door is not None and door.host not in LOCAL_HOSTS and self.role != "read":
+                raise ValueError(
+                    f"{name}.host = {door.host!r}: this door cannot tell who acts from another machine; "
+                    f"keep role = 'read', or the host {LOCAL}"
+                )
+        return self
 
 
 class AlarmRule(Section):

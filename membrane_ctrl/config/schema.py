@@ -15,7 +15,7 @@ from firmware_iface.settings import AravisCameraConfig, Section, UvcCameraConfig
 from membrane_ctrl.config.control import LimitsConfig, LoopConfig, PumpConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.port import AlarmsConfig, PortConfig
+from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig
 
 __all__ = [
     "CameraConfig", "Config", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig", "OpticsConfig",
@@ -104,6 +104,7 @@ class Config(Section):
     recording: RecordingConfig = RecordingConfig()
     port: PortConfig = PortConfig()
     alarms: AlarmsConfig = AlarmsConfig()
+    doors: DoorsConfig = DoorsConfig()
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":

@@ -6,6 +6,8 @@ foreign `Host` (DNS rebinding) or `Origin` (another page, also over web sockets)
 sent by other sites (`SameSite=Strict`).
 """
 
+from __future__ import annotations
+
 import asyncio
 import hashlib
 import hmac
@@ -16,13 +18,14 @@ import time
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from typing import Any, Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 from urllib.parse import parse_qs, urlsplit
-
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model import errors
+
+if TYPE_CHECKING:  # the doors know these actions, too, and have no web server
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "membrane_ctrl"
 SESSION_S = 12 * 3600.0  # a shift; then log in again
@@ -315,9 +318,9 @@ def may(user: WebUser, port_role: str, action: Action) -> bool:
     return outranks(user.role, action.role) and outranks(port_role, action.role)
 
 
-def request(action: Action, user: WebUser, given: str, take_over: bool = False) -> dict[str, Any]:
-    """The request to send. Raises ValueError with what is wrong with the input."""
-    asked: dict[str, Any] = {"do": action.do, "why": f"web: {user.name}", "take_over": take_over}
+def request(action: Action, why: str, given: str, take_over: bool = False) -> dict[str, Any]:
+    """The request to send, for the reason `why`. Raises ValueError with what is wrong with the input."""
+    asked: dict[str, Any] = {"do": action.do, "why": why, "take_over": take_over}
     if action.asks == "number":
         try:
             value = float(given.replace(",", "."))

@@ -195,7 +195,7 @@ class WebPage:
             ui.notify(f"{action.label}: needs the role {action.role}", type="negative")
             return
         try:
-            asked = request(action, self._user, str(given.value or ""), bool(take_over.value))
+            asked = request(action, f"web: {self._user.name}", str(given.value or ""), bool(take_over.value))
         except ValueError as error:
             ui.notify(str(error), type="negative")
             return

@@ -8,6 +8,7 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 from nicegui import app, ui
 
+from membrane_ctrl.config.port import LOCAL_HOSTS
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
@@ -15,7 +16,6 @@ from membrane_ctrl.web.feed import HoldFeed
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.panels import REPORT, run_folder
 
-_LOCAL = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_BYTES_MAX = 64_000_000
 
 
@@ -45,7 +45,7 @@ def accounts_of(options: WebOptions) -> Accounts:
         if not users:
             raise errors.InputError(f"{options.users}: no users; add one with `membrane-ctrl web add-user`")
     secure = options.certificate is not None and options.key is not None
-    if options.host not in _LOCAL and not (secure and users):
+    if options.host not in LOCAL_HOSTS and not (secure and users):
         raise errors.InputError(
             f"--host {options.host}: other machines need TLS and a login; give --certificate, --key and --users"
         )
@@ -55,7 +55,7 @@ def accounts_of(options: WebOptions) -> Accounts:
 def serve(options: WebOptions) -> None:
     """Serve until interrupted. Raises InputError for options that would open the page to others."""
     accounts = accounts_of(options)
-    hosts = frozenset({*_LOCAL, options.host, *options.names})
+    hosts = frozenset({*LOCAL_HOSTS, options.host, *options.names})
     feed = HoldFeed(Where(options.socket, options.run, logs=options.logs))
     app.add_middleware(LoginMiddleware, accounts=accounts, hosts=hosts)
     app.on_startup(feed.open)

@@ -69,7 +69,7 @@ async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
 def test_every_action_is_one_that_the_port_reads() -> None:
     given = {"number": "3,5", "text": "why not", "": ""}
     for action in (*ACTIONS, STOP):
-        asked = request(action, WebUser("anna", "tune"), given[action.asks])
+        asked = request(action, "web: anna", given[action.asks])
         read = parse(encode({**asked, "number": 1}))
         assert read.do == action.do
         assert read.why == "web: anna"
@@ -91,4 +91,4 @@ def test_the_lesser_of_both_roles_counts(user: str, port: str, allowed: bool) ->
 def test_what_is_no_number_is_not_sent(text: str) -> None:
     setpoint = next(action for action in ACTIONS if action.do == "setpoint")
     with pytest.raises(ValueError, match="Setpoint: enter a"):
-        request(setpoint, WebUser("anna", "operate"), text)
+        request(setpoint, "web: anna", text)

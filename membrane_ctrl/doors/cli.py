@@ -1,0 +1,88 @@
+"""`membrane-ctrl doors`: one process that follows a hold and serves it to the lab's other systems."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from membrane_ctrl.model import errors
+
+if TYPE_CHECKING:
+    from membrane_ctrl.doors.names import Door
+
+_LIBRARIES = {"mqtt": "aiomqtt", "opcua": "asyncua", "epics": "softioc"}  # each door's module, and what it needs
+
+app = typer.Typer(
+    invoke_without_command=True,
+    rich_markup_mode="markdown",
+    help="Open the doors of `[doors]`: the hold's values by MQTT, OPC UA and EPICS, and commands by role.",
+)
+
+
+@app.callback()
+def doors(
+    context: typer.Context,
+    config: Annotated[Path | None, typer.Option("--config", help="Configuration with the table `[doors]`.")] = None,
+    logs: Annotated[Path | None, typer.Option("--logs", help="Folder of the runs.")] = None,
+    socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
+) -> None:
+    """Serve until interrupted."""
+    if context.invoked_subcommand is not None:
+        return
+    from membrane_ctrl.cli.options import configured
+    from membrane_ctrl.doors.names import Door
+
+    settings = configured(config)
+    if not any(getattr(settings.doors, name) for name in _LIBRARIES):
+        raise errors.InputError("no door to open: add [doors.mqtt], [doors.opcua] or [doors.epics] (docs/doors.md)")
+    asyncio.run(_serve(Door.to(settings, logs, socket)))
+
+
+@app.command()
+def names() -> None:
+    """Print the published names with their units, as a Markdown table."""
+    from membrane_ctrl.doors.names import TABLE
+
+    print("| name | unit | what |\n|---|---|---|")
+    for each in TABLE:
+        print(f"| `{each.name}` | {each.unit or 'text'} | {each.says} |")
+
+
+async def _serve(door: Door) -> None:
+    opened = _opened(door)
+    main = asyncio.current_task()
+    assert main is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)
+    wrong: BaseExceptionGroup[errors.CommandError] | None = None
+    door.feed.open()
+    try:
+        async with asyncio.TaskGroup() as all_doors:
+            for each in opened:
+                all_doors.create_task(each)
+    except* errors.CommandError as group:
+        wrong = group
+    except* asyncio.CancelledError:
+        print("doors: closed", file=sys.stderr)
+    finally:
+        await asyncio.to_thread(door.feed.close)
+    if wrong is not None:
+        raise next(each for each in wrong.exceptions if isinstance(each, errors.CommandError))
+
+
+def _opened(door: Door) -> list[Any]:
+    """The doors of the settings, to be awaited. Raises InputError for one whose library is missing."""
+    opened = []
+    for name, library in _LIBRARIES.items():
+        settings = getattr(door.settings, name)
+        if settings is None:
+            continue
+        if importlib.util.find_spec(library) is None:
+            raise errors.InputError(f"doors.{name} needs {library}: pip install 'membrane-ctrl[{name}]'")
+        opened.append(importlib.import_module(f"membrane_ctrl.doors.{name}").serve(settings, door))
+    return opened

@@ -1,0 +1,95 @@
+"""The door to EPICS: one IOC for Channel Access and PV Access; a record for each published value and each command.
+
+Numbers without contact to the hold keep their last value with the severity INVALID and the status COMM, as EPICS
+has no empty number. EPICS libraries keep their state in the process: one IOC in each.
+"""
+
+import asyncio
+import os
+import socket
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.config.port import EpicsConfig
+from membrane_ctrl.doors.names import TABLE, Door, Value
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.web.access import Action
+
+# Clients may write commands only; EPICS by itself lets them write everything
+_RULES = "ASG(DEFAULT) { RULE(1, READ) }\nASG(COMMAND) { RULE(1, READ) RULE(1, WRITE) }\n"
+_TEXT_BYTES = 512
+_DIGITS = 4
+
+
+async def serve(config: EpicsConfig, door: Door) -> None:
+    """Serve until cancelled. Raises DeviceError if the address is taken."""
+    _require_free(config)
+    addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
+    addresses |= {"EPICS_CAS_BEACON_ADDR_LIST": config.host, "EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO"}
+    addresses |= {"EPICS_PVAS_BEACON_ADDR_LIST": config.host, "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO"}
+    os.environ.update(addresses)
+    os.environ.update(EPICS_CA_SERVER_PORT=str(config.ca_port), EPICS_PVAS_SERVER_PORT=str(config.pva_port))
+    from softioc import alarm, asyncio_dispatcher, builder, imports, softioc  # they read the environment
+
+    builder.SetDeviceName(door.settings.name)
+    records = {each.name: _record(builder, each.name, each.unit, each.says) for each in TABLE}
+    for do, action in door.commands.items():
+        _command(builder, door, do, action, records["answer"])
+    builder.LoadDatabase()
+    with tempfile.TemporaryDirectory() as folder:
+        rules = Path(folder) / "rules.acf"
+        files.write_text_atomic(rules, _RULES)
+        imports.dbCore.asSetFilename(str(rules).encode())
+        softioc.iocInit(asyncio_dispatcher.AsyncioDispatcher(asyncio.get_running_loop()))
+    print(f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}", file=sys.stderr, flush=True)
+    while True:
+        live = door.live
+        for name, value in door.values().items():
+            record = records[name]
+            if value is not None:
+                record.set(_fitting(value))
+            else:
+                record.set_alarm(alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM)
+        await asyncio.sleep(door.settings.period_s)
+
+
+def _require_free(config: EpicsConfig) -> None:
+    """EPICS would take another port instead, where nobody looks. Raises DeviceError."""
+    for port in (config.ca_port, config.pva_port):
+        try:
+            socket.create_server((config.host, port)).close()
+        except OSError as error:
+            where = f"{config.host}:{port}"
+            raise errors.DeviceError(f"epics: {where}: {errors.os_reason(error)}; choose another port") from None
+
+
+def _fitting(value: Value) -> Value:
+    """A text that fits its record."""
+    if isinstance(value, str):
+        return value.encode()[: _TEXT_BYTES - 1].decode("utf-8", "ignore")
+    return value
+
+
+def _record(builder: Any, name: str, unit: str, says: str) -> Any:
+    says = says.replace("`", "")[:40]  # EPICS has no more room
+    if not unit:
+        return builder.longStringIn(name, length=_TEXT_BYTES, DESC=says)
+    return builder.aIn(name, EGU=unit, PREC=_DIGITS, DESC=says)
+
+
+def _command(builder: Any, door: Door, do: str, action: Action, answer: Any) -> None:
+    """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is there."""
+
+    async def obey(value: object) -> None:
+        answer.set(_fitting(await door.ask("epics", do, value if action.asks else "")))
+
+    common = {"on_update": obey, "always_update": True, "ASG": "COMMAND", "DESC": action.label}
+    if action.asks == "number":
+        low, high = door.bounds[do]
+        builder.aOut(f"do:{do}", EGU=action.unit, PREC=_DIGITS, LOPR=low, HOPR=high, blocking=True, **common)
+    elif action.asks == "text":
+        builder.longStringOut(f"do:{do}", length=_TEXT_BYTES, blocking=True, **common)
+    else:
+        builder.boolOut(f"do:{do}", ZNAM="do", ONAM="do", blocking=True, **common)

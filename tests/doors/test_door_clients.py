@@ -1,0 +1,274 @@
+"""Clients of other makers at the doors read, are refused or obeyed, and survive a restart of either side."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.control_port.port_run import PortRun, port_run
+from tests.web.test_page import free_port, ticking
+
+MOSQUITTO = shutil.which("mosquitto") or ("/usr/sbin/mosquitto" if Path("/usr/sbin/mosquitto").exists() else None)
+PATIENCE_S = 60.0
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto: apt-get install mosquitto mosquitto-clients"),
+]
+
+
+@asynccontextmanager
+async def program(*words: str, **env: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """A program of the test; killed at the end if it still runs."""
+    process = await asyncio.create_subprocess_exec(
+        *words, env=os.environ | env, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
+@asynccontextmanager
+async def doors(folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """`membrane-ctrl doors` with the settings, once all doors are open."""
+    (folder / "lab.toml").write_text(text)
+    words = ["--config", str(folder / "lab.toml"), "--logs", str(folder)]
+    async with program(sys.executable, "-c", "from membrane_ctrl.doors.cli import app; app()", *words) as process:
+        wanted = {name for name in ("mqtt", "opcua", "epics") if f"[doors.{name}]" in text}
+        assert process.stdout is not None
+        async with asyncio.timeout(PATIENCE_S):
+            while wanted:
+                line = (await process.stdout.readline()).decode()
+                assert line, "the doors ended"
+                wanted.discard(line.partition(":")[0])
+        yield process
+
+
+@asynccontextmanager
+async def broker(port: int) -> AsyncIterator[None]:
+    assert MOSQUITTO is not None
+    async with program(MOSQUITTO, "-p", str(port)):
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                try:
+                    (await asyncio.open_connection("127.0.0.1", port))[1].close()
+                    break
+                except OSError:
+                    await asyncio.sleep(0.05)
+        yield
+
+
+@asynccontextmanager
+async def held(folder: Path) -> AsyncIterator[PortRun]:
+    async with port_run(folder) as run:
+        task = asyncio.create_task(ticking(run))
+        try:
+            yield run
+        finally:
+            task.cancel()
+
+
+async def heard(port: int, topic: str, until: str = "") -> str:
+    """The first message with that text, by mosquitto's own client."""
+    async with (
+        program("stdbuf", "-oL", "mosquitto_sub", "-p", str(port), "-t", topic) as client,
+        asyncio.timeout(PATIENCE_S),
+    ):
+        assert client.stdout is not None
+        while True:
+            line = (await client.stdout.readline()).decode()
+            assert line, "the broker ended"
+            if until in line:
+                return line.strip()
+
+
+async def told(port: int, topic: str, text: str, *more: str) -> None:
+    async with program("mosquitto_pub", "-p", str(port), "-t", topic, "-m", text, *more) as client:
+        assert await client.wait() == 0
+
+
+@asynccontextmanager
+async def hearing(port: int, topic: str) -> AsyncIterator[Callable[[], Awaitable[str]]]:
+    """A subscriber; what it yields waits for its next message."""
+    async with program("stdbuf", "-oL", "mosquitto_sub", "-p", str(port), "-t", topic, "-d") as client:
+        assert client.stdout is not None
+        stdout = client.stdout
+
+        async def answer() -> str:
+            async with asyncio.timeout(PATIENCE_S):
+                while (line := (await stdout.readline()).decode()).startswith(("Client", "Subscribed")):
+                    pass
+            return line.strip()
+
+        async with asyncio.timeout(PATIENCE_S):
+            while b"Subscribed" not in await stdout.readline():
+                pass
+        yield answer
+
+
+async def said_by(script: str, ports: dict[str, int], wanted: object = None) -> dict[str, Any]:
+    """What a client's program prints, as JSON."""
+    code = script.format(**ports, wanted=wanted)
+    env = {
+        "EPICS_CA_ADDR_LIST": "127.0.0.1",
+        "EPICS_CA_AUTO_ADDR_LIST": "NO",
+        "EPICS_CA_SERVER_PORT": str(ports["ca"]),
+    }
+    env |= {"EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{ports['pva']}", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+    async with program(sys.executable, "-c", code, **env) as client, asyncio.timeout(PATIENCE_S):
+        out = (await client.communicate())[0].decode()
+    assert client.returncode == 0, out
+    return dict(json.loads(out.splitlines()[-1]))
+
+
+SERVERS = """[doors]
+role = "operate"
+period_s = 0.5
+[doors.opcua]
+port = {opcua}
+[doors.epics]
+ca_port = {ca}
+pva_port = {pva}
+"""
+OPCUA_CLIENT = """
+import asyncio, json
+from asyncua import Client, ua
+url = "opc.tcp://127.0.0.1:{opcua}/membrane_ctrl"
+async def name_of(awaited):
+    try:
+        return await awaited
+    except ua.UaError as error:
+        return type(error).__name__
+async def main():
+    found = dict()
+    async with Client(url) as client:
+        space = await client.get_namespace_index("urn:membrane-ctrl:mirror")
+        node = lambda name: client.get_node(f"ns={{space}};s=mirror{{name}}")
+        found["error_um"] = await node(".error_um").read_value()
+        found["unit"] = (await node(".error_um.unit").read_value()).DisplayName.Text
+        found["state"] = await node(".state").read_value()
+        found["write"] = await name_of(node(".error_um").write_value(3.0))
+        found["setpoint"] = (await node("").call_method(f"{{space}}:setpoint", 1.5)).partition(", ")[2]
+        found["keep"] = await name_of(node(".do.keep").read_browse_name())
+    admin = Client(url)
+    admin.set_user("admin")
+    found["admin"] = await name_of(admin.connect())
+    print(json.dumps(found))
+asyncio.run(main())
+"""
+CA_CLIENT = """
+import json
+from caproto.sync.client import read, write
+value = read("mirror:error_um", data_type="control", repeater=False)
+refused = write("mirror:error_um", 5.0, notify=True, repeater=False).status.name
+write("mirror:do:setpoint", -2.0, notify=True, timeout=20, repeater=False)
+answer = bytes(read("mirror:answer", repeater=False).data).decode().rstrip(chr(0)).partition(", ")[2]
+print(json.dumps(dict(error_um=value.data[0], unit=value.metadata.units.decode(), write=refused, answer=answer)))
+"""
+PVA_CLIENT = """
+import json
+from p4p.client.thread import Context, RemoteError
+with Context("pva") as client:
+    found = dict(error_um=client.get("mirror:error_um"), state=client.get("mirror:state"), write="done")
+    try:
+        client.put("mirror:error_um", 5.0)
+    except RemoteError:
+        found["write"] = "refused"
+    client.put("mirror:do:mark", "pva", timeout=20, request="record[process=true,block=true]")
+    found["answer"] = client.get("mirror:answer").partition(", ")[2]
+print(json.dumps(found))
+"""
+WATCHER = """
+import asyncio, json
+from asyncua import Client
+from p4p.client.thread import Context
+async def main():
+    async with Client("opc.tcp://127.0.0.1:{opcua}/membrane_ctrl") as client:
+        space = await client.get_namespace_index("urn:membrane-ctrl:mirror")
+        node = client.get_node(f"ns={{space}};s=mirror.error_um")
+        with Context("pva") as pva:
+            for _ in range(300):
+                value = await node.read_data_value(raise_on_bad_status=False)
+                found = dict(opcua=value.StatusCode.name, epics=pva.get("mirror:error_um").severity)
+                if found == {wanted}:
+                    break
+                await asyncio.sleep(0.1)
+    print(json.dumps(found))
+asyncio.run(main())
+"""
+MQTT = """[doors]
+name = "bench"
+role = "operate"
+period_s = 0.5
+[doors.mqtt]
+port = {port}
+"""
+
+
+async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
+    port, base = free_port(), "membrane/bench"
+    settings = MQTT.format(port=port)
+    async with AsyncExitStack() as first_broker, AsyncExitStack() as first_hold, AsyncExitStack() as door_stack:
+        run = await first_hold.enter_async_context(held(tmp_path))
+        await first_broker.enter_async_context(broker(port))
+        await told(port, f"{base}/do/vent", "PRESS", "-r")  # stays at the broker
+        async with hearing(port, f"{base}/answer") as answer:
+            door = await door_stack.enter_async_context(doors(tmp_path, settings))
+            assert await answer() == "vent refused: a retained message is no command"
+            values = json.loads(await heard(port, f"{base}/values", '"hold"'))
+            assert (values["error_um"], values["run"]) == (0.25, "the-run")
+            await told(port, f"{base}/do/setpoint", "1.5")
+            assert (await answer()).endswith("mqtt: setpoint: done")
+        assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1.5)]
+        found = json.loads(await heard(port, "homeassistant/device/membrane_bench/config"))
+        assert found["availability_topic"] == f"{base}/availability"
+        await first_broker.aclose()
+        async with broker(port):  # which knows nothing of the first one
+            await heard(port, f"{base}/availability", "online")
+            await heard(port, "homeassistant/device/membrane_bench/config")
+            await first_hold.aclose()
+            await heard(port, f"{base}/availability", "offline")
+            assert json.loads(await heard(port, f"{base}/values"))["error_um"] is None
+            async with held(tmp_path):
+                await heard(port, f"{base}/availability", "online")
+                door.kill()
+                await heard(port, f"{base}/availability", "offline")
+
+
+@pytest.mark.campaign
+async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
+    ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
+    settings = SERVERS.format(**ports)
+    async with held(tmp_path) as run, doors(tmp_path, settings):
+        found = await said_by(OPCUA_CLIENT, ports)
+        assert found == {
+            "error_um": 0.25, "unit": "um", "state": "hold", "write": "BadUserAccessDenied",
+            "admin": "BadIdentityTokenRejected", "setpoint": "opcua: setpoint: done", "keep": "BadNodeIdUnknown",
+        }  # fmt: skip
+        found = await said_by(CA_CLIENT, ports)
+        assert found == {"error_um": 0.25, "unit": "um", "write": "ECA_NOWTACCESS", "answer": "epics: setpoint: done"}
+        found = await said_by(PVA_CLIENT, ports)
+        assert found == {"error_um": 0.25, "state": "hold", "write": "refused", "answer": "epics: mark: done"}
+        assert [(each.kind, each.text) for each in run.asked] == [("setpoint", ""), ("setpoint", ""), ("mark", "pva")]
+
+
+@pytest.mark.campaign
+async def test_opc_ua_and_epics_survive_the_hold(tmp_path: Path) -> None:
+    ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
+    good, bad = {"opcua": "Good", "epics": 0}, {"opcua": "BadNoCommunication", "epics": 3}
+    async with doors(tmp_path, SERVERS.format(**ports)):
+        for _ in range(2):
+            async with held(tmp_path):
+                assert await said_by(WATCHER, ports, good) == good
+            assert await said_by(WATCHER, ports, bad) == bad

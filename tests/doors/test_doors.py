@@ -1,0 +1,193 @@
+"""One table for all doors: its names and units, what is shown without contact, and who may act."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import socket
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from membrane_ctrl.config.port import DoorsConfig, EpicsConfig, MqttConfig, OpcuaConfig
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.doors import mqtt
+from membrane_ctrl.doors.cli import app
+from membrane_ctrl.doors.names import COMMANDS, TABLE, Door, values
+from membrane_ctrl.model.errors import DeviceError, InputError
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.web.feed import HoldFeed, HoldSeen
+from tests.control_port.port_run import port_run
+
+PAGE = Path(__file__).parents[2] / "docs" / "doors.md"
+SUFFIX = {"um": "_um", "um/s": "_um_per_s", "Pa": "_pa", "°C": "_c", "ms": "_ms", "s": "_s", "": ""}
+FAULT = {"code": 7, "name": "laser_lost", "cause": "no light", "remedy": "clean it"}
+
+
+def seen_hold(**row: float | None) -> HoldSeen:
+    status = {"state": "hold", "why": "", "fault": None, "row": {"mono_s": 100.0, **row}}
+    return HoldSeen("run-1", "tune", status, time.monotonic(), "")
+
+
+def figure(**changed: object) -> ShapeEstimate:
+    coeffs_um = np.arange(1.0, 37.0)
+    made = ShapeEstimate(97.5, "full", coeffs_um, 0.0, np.eye(36), 500.0, 0.1, 0.0, 1.0, 1.0, 80.0, 0.0, "ok")
+    return dataclasses.replace(made, **changed)  # type: ignore[arg-type]
+
+
+def door_with(role: str = "read", seen: HoldSeen | None = None, port: Path | None = None) -> Door:
+    feed = HoldFeed(Where(socket=port))
+    feed.seen = seen or seen_hold()
+    return Door(feed, Config(doors=DoorsConfig(role=role)))  # type: ignore[arg-type]
+
+
+def test_names_are_unique_and_carry_their_units() -> None:
+    names = [each.name for each in TABLE]
+    assert len(set(names)) == len(names)
+    for each in TABLE:
+        assert each.unit == "1" or each.name.endswith(SUFFIX[each.unit]), each
+        assert len(f"do:{each.name}") <= 60 - 31, "an EPICS name has room for 60 letters with that of the mirror"
+
+
+def test_the_page_has_the_table() -> None:
+    printed = CliRunner().invoke(app, ["names"])
+    assert printed.exit_code == 0
+    assert printed.stdout in PAGE.read_text(encoding="utf-8")
+    assert all(f"`{name}`" in PAGE.read_text(encoding="utf-8") for name in COMMANDS)
+
+
+def test_each_tick_value_is_that_of_the_tick() -> None:
+    row = {name: float(place) for place, name in enumerate(FIELDS)}
+    found = values(seen_hold(**row))
+    shared = [each.name for each in TABLE if each.unit and each.name in FIELDS]
+    assert len(shared) == 15
+    assert [found[name] for name in shared] == [row[name] for name in shared]
+    assert found["state"] == "hold"
+    assert found["why"] == "as it should be"
+    assert set(found) == {each.name for each in TABLE} - {"answer"}
+
+
+def test_without_contact_no_number_is_shown() -> None:
+    live = dataclasses.replace(seen_hold(error_um=3.0), figure=figure())
+    for seen in (
+        dataclasses.replace(live, problem="the run has ended"),
+        dataclasses.replace(live, seen_s=time.monotonic() - 60.0),
+    ):
+        found = values(seen)
+        assert found["state"] == "no contact"
+        assert "run has ended" in str(found["why"]) or "no status for 60 s" in str(found["why"])
+        assert [name for name, value in found.items() if value is not None] == ["state", "why", "run"]
+
+
+def test_a_figure_has_its_age_and_terms() -> None:
+    found = values(dataclasses.replace(seen_hold(), figure=figure(sag_sigma_um=math.nan)))
+    assert found["figure_age_s"] == 2.5
+    assert [found[f"z{j}_um"] for j in range(4, 12)] == [float(j) for j in range(4, 12)]
+    assert found["sag_sigma_um"] is None, "JSON has no NaN"
+
+
+def test_faults_and_notices_are_in_words() -> None:
+    seen = seen_hold()
+    seen.status.update(fault=FAULT, maintenance={"leak": "the leak grows"}, recording={"disk": "disk full"})
+    found = values(seen)
+    assert found["fault"] == "7 laser_lost: no light; clean it"
+    assert found["notices"] == "the leak grows; disk full"
+
+
+@pytest.mark.parametrize(
+    ("role", "command", "refused"),
+    [("read", "stop", True), ("operate", "stop", False), ("operate", "keep", True), ("tune", "keep", False)],
+)
+async def test_a_door_asks_by_its_role(tmp_path: Path, role: str, command: str, refused: bool) -> None:
+    async with port_run(tmp_path) as run:
+        door = door_with(role, dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        said = await door.ask("mqtt", command)
+        assert ("needs the role" in said) is refused
+        assert [asked.kind for asked in run.asked] == ([] if refused else [command])
+        assert door.values()["answer"] == said
+        assert (command in door.commands) is not refused
+
+
+async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
+    door = door_with("tune", dataclasses.replace(seen_hold(), role="read"))
+    assert "stop refused: needs the role operate" in await door.ask("epics", "stop")
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "says"),
+    [
+        ("setpoint", "", "enter a number"),
+        ("setpoint", "nan", "finite"),
+        ("setpoint", "1e9", "outside the limits"),
+        ("mark", "a\nb", "printable"),
+        ("mark", "x" * 501, "longer than 500 bytes"),
+        ("gains", "", "no such command"),
+        ("__class__", "", "no such command"),
+    ],
+)
+async def test_nonsense_gets_an_answer(tmp_path: Path, command: str, given: str, says: str) -> None:
+    async with port_run(tmp_path) as run:
+        door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        assert says in await door.ask("opcua", command, given)
+        assert run.asked == [] or given == "1e9", "the tick judges limits"
+
+
+def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None:
+    reader = mqtt.discovery(door_with(), "membrane/mirror")["components"]
+    assert set(reader) == {each.name for each in TABLE}
+    assert reader["error_um"]["unit_of_measurement"] == "um"
+    assert "[:255]" in reader["why"]["value_template"]
+    found = mqtt.discovery(door_with("operate"), "membrane/mirror")
+    json.dumps(found, allow_nan=False)
+    commands = {name: each for name, each in found["components"].items() if name.startswith("do_")}
+    assert "do_keep" not in commands
+    assert commands["do_stop"]["platform"] == "button"
+    limits = Config().limits
+    setpoint = commands["do_setpoint"]
+    assert (setpoint["min"], setpoint["max"]) == (limits.displacement_min_um, limits.displacement_max_um)
+    ids = [each["unique_id"] for each in found["components"].values()]
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("door", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str)
+def test_nobody_unknown_acts_from_another_machine(door: dict[str, object]) -> None:
+    DoorsConfig(**door)  # type: ignore[arg-type]
+    with pytest.raises(ValidationError, match="cannot tell who acts from another machine"):
+        DoorsConfig(role="operate", **door)  # type: ignore[arg-type]
+    DoorsConfig(role="operate", mqtt=MqttConfig(host="broker.lab"))  # the broker knows its users
+
+
+def test_no_door_is_said(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["--logs", str(tmp_path)])
+    assert isinstance(done.exception, InputError)
+    assert "add [doors.mqtt], [doors.opcua] or [doors.epics]" in str(done.exception)
+
+
+@pytest.mark.parametrize("name", ["mqtt", "opcua", "epics"])
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda library: None)
+    (tmp_path / "lab.toml").write_text(f"[doors.{name}]\n")
+    done = CliRunner().invoke(app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")])
+    assert isinstance(done.exception, InputError)
+    assert f"pip install 'membrane-ctrl[{name}]'" in str(done.exception)
+
+
+def test_a_taken_port_is_named(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        (tmp_path / "lab.toml").write_text(f"[doors.epics]\nca_port = {port}\n")
+        done = CliRunner().invoke(app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")])
+    assert isinstance(done.exception, DeviceError)
+    assert f"epics: 127.0.0.1:{port}: address already in use" in str(done.exception)
+
+
+async def test_a_missing_password_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"doors.mqtt.password_file: .*none"):
+        await mqtt.serve(MqttConfig(password_file=str(tmp_path / "none")), door_with())
