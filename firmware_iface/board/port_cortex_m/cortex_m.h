@@ -2,7 +2,10 @@
 #ifndef MEMBRANE_CORTEX_M_H
 #define MEMBRANE_CORTEX_M_H
 
+#include <stdbool.h>
 #include <stdint.h>
+
+#include "ring.h"
 
 #define WORD(address) (*(volatile uint32_t *)(address))
 #define AIRCR WORD(0xE000ED0Cu)      /* application interrupt and reset control, B3.2.6 */
@@ -22,6 +25,10 @@ void start(void);
 
 /* Any fault, any interrupt that nobody expects: port_outputs_safe(), then a reset. */
 void fault(void);
+
+/* What the Modbus line's interrupt received, and whether a byte was lost. */
+extern struct ring uart_received;
+extern volatile bool uart_lost;
 
 /* Of the port. Drives pump and vent to 0 without buffers or interrupts. */
 void port_outputs_safe(void);

@@ -1,5 +1,6 @@
 /* Reset and faults of a Cortex-M3 or M4 (ARMv7-M architecture reference manual, DDI 0403). */
 #include "cortex_m.h"
+#include "hal.h"
 
 #define MPU_CTRL WORD(0xE000ED94u)   /* B3.5.5 */
 #define MPU_RBAR WORD(0xE000ED9Cu)
@@ -15,10 +16,7 @@ int main(void);
 
 void fault(void)
 {
-    port_outputs_safe();
-    AIRCR = AIRCR_RESET;
-    for (;;) {
-    }
+    hal_reset();
 }
 
 static void fault_guard(void)

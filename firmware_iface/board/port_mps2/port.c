@@ -46,15 +46,7 @@ struct uart {
 #define UART0 ((volatile struct uart *)0x40004000u)
 #define UART1 ((volatile struct uart *)0x40005000u)
 
-#define RING 512u /* a power of two: a damaged index still points into it */
-
-struct ring {
-    uint8_t bytes[RING];
-    volatile uint32_t put, got;
-};
-
-static struct ring received, sending, film_sending;
-static volatile uint32_t lost; /* bytes of UART0 */
+static struct ring sending, film_sending;
 
 static struct {
     struct bench_line line;
@@ -68,32 +60,17 @@ static struct {
 extern const uint8_t stored_settings[];
 extern const uint32_t stored_settings_length;
 
-static bool ring_put(struct ring *ring, uint8_t byte)
-{
-    const bool room = (ring->put - ring->got) < RING;
-    if (room) {
-        ring->bytes[ring->put % RING] = byte;
-        ring->put++;
-    }
-    return room;
-}
-
 static void send_on(volatile struct uart *uart, struct ring *ring)
 {
-    while (((uart->state & UART_TX_FULL) == 0u) && (ring->put != ring->got)) {
-        uart->data = ring->bytes[ring->got % RING];
-        ring->got++;
+    while (((uart->state & UART_TX_FULL) == 0u) && !ring_empty(ring)) {
+        uart->data = ring_get(ring);
     }
 }
 
 static void write_all(volatile struct uart *uart, struct ring *ring, const uint8_t *bytes, size_t count)
 {
     const uint32_t before = hal_lock();
-    if ((RING - (ring->put - ring->got)) >= count) {
-        for (size_t i = 0u; i < count; i++) {
-            (void)ring_put(ring, bytes[i]);
-        }
-    }
+    ring_put_all(ring, bytes, count);
     send_on(uart, ring);
     hal_unlock(before);
 }
@@ -158,46 +135,6 @@ void hal_watchdog_feed(void)
     WATCHDOG_LOCK = 0u;
 }
 
-void hal_reset(void)
-{
-    port_outputs_safe();
-    AIRCR = AIRCR_RESET;
-    for (;;) {
-    }
-}
-
-void hal_wait(void)
-{
-    __asm volatile("wfi" ::: "memory");
-}
-
-uint32_t hal_lock(void)
-{
-    uint32_t before;
-    __asm volatile("mrs %0, primask\n cpsid i" : "=r"(before)::"memory");
-    return before;
-}
-
-void hal_unlock(uint32_t before)
-{
-    __asm volatile("msr primask, %0" ::"r"(before) : "memory");
-}
-
-int hal_uart_read(void)
-{
-    int found = HAL_UART_EMPTY;
-    if (lost != 0u) {
-        lost = 0u;
-        found = HAL_UART_ERROR;
-    } else if (received.put != received.got) {
-        found = received.bytes[received.got % RING];
-        received.got++;
-    } else {
-        /* nothing */
-    }
-    return found;
-}
-
 void hal_uart_write(const uint8_t *bytes, size_t count)
 {
     write_all(UART0, &sending, bytes, count);
@@ -209,10 +146,10 @@ void mps2_uart0(void)
     while ((UART0->state & UART_RX_FULL) != 0u) {
         if ((UART0->state & UART_RX_LOST) != 0u) {
             UART0->state = UART_RX_LOST;
-            lost = 1u;
+            uart_lost = true;
         }
-        if (!ring_put(&received, (uint8_t)UART0->data)) {
-            lost = 1u;
+        if (!ring_put(&uart_received, (uint8_t)UART0->data)) {
+            uart_lost = true;
         }
     }
     send_on(UART0, &sending);

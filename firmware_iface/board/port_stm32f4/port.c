@@ -26,15 +26,8 @@
 #endif
 
 #define LASER_BAUD 115200u
-#define RING 512u /* a power of two: a damaged index still points into it */
 
-struct ring {
-    uint8_t bytes[RING];
-    volatile uint32_t put, got;
-};
-
-static struct ring received, sending;
-static volatile bool lost;
+static struct ring sending;
 static bool enable_high;
 
 extern const uint8_t stored_settings[];
@@ -172,70 +165,26 @@ void port_outputs_safe(void)
     pins_safe();
 }
 
-void hal_reset(void)
-{
-    port_outputs_safe();
-    AIRCR = AIRCR_RESET;
-    for (;;) {
-    }
-}
-
-void hal_wait(void)
-{
-    __asm volatile("wfi" ::: "memory");
-}
-
-uint32_t hal_lock(void)
-{
-    uint32_t before;
-    __asm volatile("mrs %0, primask\n cpsid i" : "=r"(before)::"memory");
-    return before;
-}
-
-void hal_unlock(uint32_t before)
-{
-    __asm volatile("msr primask, %0" ::"r"(before) : "memory");
-}
-
 void stm32_tick(void)
 {
     board_tick();
 }
 
-int hal_uart_read(void)
-{
-    int found = HAL_UART_EMPTY;
-    if (lost) {
-        lost = false;
-        found = HAL_UART_ERROR;
-    } else if (received.put != received.got) {
-        found = received.bytes[received.got % RING];
-        received.got++;
-    } else {
-        /* nothing */
-    }
-    return found;
-}
-
 /* Sends what fits. When all is sent, the interrupt "transmission complete" turns the RS-485 driver off. */
 static void send_on(void)
 {
-    while (((USART2->sr & USART_TXE) != 0u) && (sending.put != sending.got)) {
-        USART2->dr = sending.bytes[sending.got % RING];
-        sending.got++;
+    while (((USART2->sr & USART_TXE) != 0u) && !ring_empty(&sending)) {
+        USART2->dr = ring_get(&sending);
     }
     const uint32_t quiet = USART2->cr1 & ~(USART_TXEIE | USART_TCIE);
-    USART2->cr1 = quiet | ((sending.put != sending.got) ? USART_TXEIE : USART_TCIE);
+    USART2->cr1 = quiet | (ring_empty(&sending) ? USART_TCIE : USART_TXEIE);
 }
 
 void hal_uart_write(const uint8_t *bytes, size_t count)
 {
     const uint32_t before = hal_lock();
-    if ((RING - (sending.put - sending.got)) >= count) {
-        for (size_t i = 0u; i < count; i++) {
-            sending.bytes[sending.put % RING] = bytes[i];
-            sending.put++;
-        }
+    ring_put_all(&sending, bytes, count);
+    if (!ring_empty(&sending)) {
         GPIOA->bsrr = DRIVER_PIN;
         send_on();
     }
@@ -247,14 +196,11 @@ void stm32_usart2(void)
     const uint32_t status = USART2->sr; /* with the read of DR this clears the errors, RM0390 25.6.1 */
     if ((status & (USART_RXNE | USART_WRONG)) != 0u) {
         const uint8_t byte = (uint8_t)USART2->dr;
-        if (((status & USART_WRONG) != 0u) || ((received.put - received.got) >= RING)) {
-            lost = true;
-        } else {
-            received.bytes[received.put % RING] = byte;
-            received.put++;
+        if (((status & USART_WRONG) != 0u) || !ring_put(&uart_received, byte)) {
+            uart_lost = true;
         }
     }
-    if (sending.put != sending.got) {
+    if (!ring_empty(&sending)) {
         send_on();
     } else if ((status & USART_TC) != 0u) {
         USART2->cr1 &= ~(USART_TXEIE | USART_TCIE);
