@@ -216,7 +216,7 @@ def live_answer(live: LiveReconstructor, stack: FrameStack, truth: FloatArray) -
     terms = list(TERMS)
     true_um = 1e3 * np.append(sag_gradient() @ truth, (parameter_to_coeffs() @ truth)[terms])
     own = np.append(found.sag_sigma_um, np.sqrt(np.diag(found.covariance_um2)[terms]))
-    common = np.append(found.geometry_sag_sigma_um, np.sqrt(np.diag(live.geometry_covariance_um2)[terms]))
+    common = np.append(found.geometry_sag_sigma_um, np.sqrt(np.diag(live.common_covariance_um2)[terms]))
     return np.stack([np.append(found.sag_um, found.coeffs_um[terms]) - true_um, own, common])
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from membrane_ctrl.config.schema import CameraConfig
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.reconstruct import Fit, Points, Tracer
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.reconstruct import NormalMatrix, Points, Tracer
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -63,10 +63,9 @@ class BinGrid:
         return total / len(self._around) - centre
 
 
-# Linear uncertainty of one cycle: white noise of the phase, or the scatter of the slopes if that is larger.
+# Linear uncertainty of one cycle from white noise of the phase.
 #
-# cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D. It excludes errors that all pixels
-# share (geometry, gamma of the display, motion of the film).
+# cov(parameters) = M^-1 (var_x M_x + var_y M_y) M^-1 with M = M_x + M_y = D^T W D.
 
 QUANTISATION_VARIANCE_ADU2 = 1 / 12  # of a value rounded to an integer
 
@@ -102,17 +101,7 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
     return squares
 
 
-def parameter_covariance(fit: Fit, slope_variance: FloatArray) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the fit's parameters.
-
-    Parameters
-    ----------
-    slope_variance : (2,) array
-        Expected variance of an x and of a y slope of unit weight; the variance of the fit's own residual is used
-        where it is larger.
-    """
-    free = max(fit.weight_sum - PARAMETERS / 2, 1.0)  # 36 parameters from two slopes a point
-    seen = np.array([fit.residual_x**2, fit.residual_y**2]) * fit.weight_sum / free
-    variance_x, variance_y = np.maximum(slope_variance, seen)
-    normal = fit.normal
+def parameter_covariance(normal: NormalMatrix, slope_variance: FloatArray) -> FloatArray:
+    """Covariance (36, 36) in mm^2 of the fit's parameters, for the variance (2,) of an x and of a y slope."""
+    variance_x, variance_y = slope_variance
     return np.asarray(normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse)

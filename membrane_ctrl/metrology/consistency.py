@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 # A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round to about 1 mm.
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
@@ -27,21 +27,31 @@ _X_TO_Y = 5.0
 _STEP_MM = 0.01
 
 
-def blur_px(checked: Checked) -> float:
+def blur_px(phase_rad: FloatArray, contrasts: FloatArray, index: IntArray, bin_px: int) -> float:
     """Width of the blur, a Gauss's sigma in pixels: the contrast falls with the fringes' frequency.
 
     log(swing / light) = const - sigma^2 |grad phase|^2 / 2, for x and y each with its own constant. A bin of m pixels
     is itself a blur of (m^2 - 1) / 12.
+
+    Parameters
+    ----------
+    phase_rad : (2, rows, columns) array
+        Phases of x and y of the bins; NaN where unknown.
+    contrasts : (2, n) array
+        Swing over light of some bins.
+    index : (n,) int array
+        Those bins.
+    bin_px : int
+        Side of a bin.
     """
-    view, bin_px, index = checked.view, checked.binned.bin_px, checked.state.index
-    slopes, contrasts = [], []
+    slopes, contrasts_left = [], []
     for axis in range(2):
-        steep = np.sum(np.square(np.gradient(checked.phase_rad[axis])), axis=0).reshape(-1)[index] / bin_px**2
-        contrast = np.log(view.swing_adu[axis].reshape(-1)[index] / view.light.reshape(-1)[index])
+        steep = np.sum(np.square(np.gradient(phase_rad[axis])), axis=0).reshape(-1)[index] / bin_px**2
+        contrast = np.log(contrasts[axis])
         known = np.isfinite(steep) & np.isfinite(contrast)
         slopes.append(steep[known] - steep[known].mean())
-        contrasts.append(contrast[known] - contrast[known].mean())
-    steep, contrast = np.concatenate(slopes), np.concatenate(contrasts)
+        contrasts_left.append(contrast[known] - contrast[known].mean())
+    steep, contrast = np.concatenate(slopes), np.concatenate(contrasts_left)
     square = -2 * float(steep @ contrast) / max(float(steep @ steep), 1e-300) - (bin_px**2 - 1) / 12
     return math.sqrt(max(square, 0.0))
 
@@ -151,7 +161,7 @@ def examine(
     )
     sigmas = optics.geometry.sigmas or SigmasConfig()
     film, doubts = _film(bench, spread, checked)
-    blur = budget.blur_source(bench, blur_px(checked))
+    blur = budget.blur_source(bench, _blur_px(checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
@@ -172,14 +182,27 @@ def examine(
     return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
 
 
+def _blur_px(checked: Checked) -> float:
+    index, light = checked.state.index, checked.view.light.reshape(-1)
+    contrasts = checked.view.swing_adu.reshape(2, -1)[:, index] / light[index]
+    return blur_px(checked.phase_rad, contrasts, index, checked.binned.bin_px)
+
+
+def vertex_um(readings_um: FloatArray, laser_noise_um: float) -> float:
+    """1 sigma of the vertex' place from the laser's noise, or without a laser."""
+    known = np.isfinite(readings_um).all()
+    return laser_noise_um / math.sqrt(readings_um.size) if known else _UNKNOWN_UM
+
+
 def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked) -> budget.Source:
     """Where the vertex is: by the laser, or nobody knows."""
     readings = checked.stack.readings_um
+    noise_um = vertex_um(readings, LASER_NOISE_UM)
     if not np.isfinite(readings).all():
-        return budget.vertex_source(bench, _UNKNOWN_UM, "place of the vertex, without a laser")
+        return budget.vertex_source(bench, noise_um, "place of the vertex, without a laser")
     scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
-    sigma_um = math.hypot(LASER_NOISE_UM / math.sqrt(readings.size), scale_um)
-    return budget.vertex_source(bench, sigma_um, "place of the vertex, by the laser's noise and scale")
+    says = "place of the vertex, by the laser's noise and scale"
+    return budget.vertex_source(bench, math.hypot(noise_um, scale_um), says)
 
 
 def _film_um(checked: Checked) -> float:
@@ -196,7 +219,7 @@ def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[
     """The film's motion from x to y: by the laser, else by the fringes."""
     readings = checked.stack.readings_um
     if np.isfinite(readings).all():
-        sigma_um = _left_by_laser_um(readings, _film_um(checked))
+        sigma_um = left_by_laser_um(readings, _film_um(checked), LASER_NOISE_UM)
         says = "motion of the film from x to y, by the laser"
         return [budget.film_source(bench, (sigma_um,), says, paired=False)], []
     moved = unseen_motion(bench, spread)
@@ -210,15 +233,17 @@ def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[
     return [source, noise], [f"{says}, seen in the fringes: record the laser's readings"]
 
 
-def _left_by_laser_um(readings_um: FloatArray, within_um: float) -> float:
+def left_by_laser_um(readings_um: FloatArray, within_um: float, laser_noise_um: float) -> float:
     """Motion from x to y that is left in the phases, with `within_um` RMS among the frames of an axis.
 
     Corrected motion leaves the laser's noise. What is not corrected is at most what the laser saw, and hardly more
-    than a film does that moves so little from frame to frame.
+    than a film does that moves so little from frame to frame. Without readings that is all that is known.
     """
-    noise_um = LASER_NOISE_UM * math.sqrt(4 / readings_um.size)
-    if motion.worth_correcting(readings_um, LASER_NOISE_UM):
+    noise_um = laser_noise_um * math.sqrt(4 / readings_um.size)
+    if motion.worth_correcting(readings_um, laser_noise_um):
         return noise_um
+    if not np.isfinite(readings_um).all():
+        return _X_TO_Y * within_um
     seen_um = float(np.subtract(*(part.mean() for part in np.split(readings_um, 2))))
     share = (_X_TO_Y * within_um) ** 2 / ((_X_TO_Y * within_um) ** 2 + noise_um**2)
     return math.hypot(share * seen_um, math.sqrt(share) * noise_um)

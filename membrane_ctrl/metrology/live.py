@@ -7,6 +7,7 @@ and needs one or two Gauss-Newton steps with the normal matrix of the full cycle
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,8 +15,8 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics import film_law, geometry, surface, zernike
-from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray, Image
+from membrane_ctrl.metrology.uncertainty import geometry_spread, live_errors
+from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
 
 Kind = Literal["full", "fringes"]
@@ -32,8 +33,7 @@ NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
 MATRIX_KEPT_SHARE = 0.99
 # the plane z = 0 is crossed this far at most from where a ray meets the film
 _FILM_BESIDE_PLANE_MM = 25.0
-# a wrong geometry bends the figure smoothly: 40 points a parameter give its covariance to a few per cent
-_GEOMETRY_POINTS = 1500
+_SURELY = 1.2  # times the expected variance of the phases' change: more than they scatter by chance
 
 
 class LiveReconstructor:
@@ -51,7 +51,7 @@ class LiveReconstructor:
     shifts_rad : (N,) or (2, N) array, optional
         Phase steps, of x and y if they differ; equal ones if not given.
     spread : GeometrySpread, optional
-        How well the geometry is known; with it the first full cycle computes `geometry_covariance_um2`.
+        How well the geometry is known; with it the first full cycle computes `common_covariance_um2`.
 
     Raises
     ------
@@ -75,8 +75,6 @@ class LiveReconstructor:
         given = phase.equal_shifts(optics.pattern.steps) if shifts_rad is None else np.asarray(shifts_rad, float)
         self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
         self._weights = [phase.step_weights(shifts) for shifts in self._shifts_rad]
-        self._spread = spread
-        self._geometry_covariance_mm2 = np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan)
         self._slots = phase.FullSlots(optics.pattern.steps)
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
@@ -87,6 +85,8 @@ class LiveReconstructor:
         self._mm_per_rad = phase.mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = bins.pixel_sigma_adu(optics.camera.noise_adu)
         self._tracked: motion.TrackedPoints | None = None
+        bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
+        self._watch = live_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
 
     def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """One full cycle. Raises ValueError for a wrong number, size or type of frames.
@@ -120,8 +120,7 @@ class LiveReconstructor:
             state = motion.establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
             return _rejected("full", times, readings, str(error))
-        if self._spread is not None and not np.isfinite(self._geometry_covariance_mm2).all():
-            self._geometry_covariance_mm2 = self._from_geometry(self._spread, tracer, state)
+        self._watch.begin(state)
         return self._follow("full", state, times, readings)
 
     def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
@@ -148,14 +147,14 @@ class LiveReconstructor:
         return axis, axis.copy(), h
 
     @property
-    def geometry_covariance_um2(self) -> FloatArray:
-        """Covariance (36, 36) of the coefficients from how well the geometry is known, as of the last full cycle.
+    def common_covariance_um2(self) -> FloatArray:
+        """Covariance (36, 36) of the coefficients from what all cycles share: geometry, lens, screen, air, blur.
 
-        It is common to all cycles: add it to a cycle's own for a single figure, not for changes. NaN before the first
-        full cycle and without a spread.
+        Add it to a cycle's own for a single figure, not for changes. NaN before the first full cycle and without a
+        spread.
         """
         to_coeffs = surface.parameter_to_coeffs()
-        return np.asarray(1e6 * to_coeffs @ self._geometry_covariance_mm2 @ to_coeffs.T)
+        return np.asarray(1e6 * to_coeffs @ self._watch.common_mm2 @ to_coeffs.T)
 
     def sag_sensitivity(self) -> FloatArray:
         """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
@@ -167,20 +166,6 @@ class LiveReconstructor:
         known = self._reference_um is not None and math.isfinite(mean)
         z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
         return reconstruct.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
-
-    def _from_geometry(
-        self, spread: geometry_spread.GeometrySpread, tracer: reconstruct.Tracer, state: motion.TrackedPoints
-    ) -> FloatArray:
-        """Covariance (36, 36) of the parameters; NaN if the spread is so wide that a fit at its end fails."""
-        place_px = np.stack([self._grid.column_px, self._grid.row_px])[:, state.index]
-        exact = np.zeros((2, state.index.size))
-        bench = monte_carlo.TrialBench.of_points(
-            self._optics, tracer, state.surface, state.points, place_px, exact, _GEOMETRY_POINTS
-        )
-        try:
-            return monte_carlo.geometry_covariance(monte_carlo.geometry_jacobian(bench, spread), spread)
-        except ArithmeticError:
-            return np.full((surface.PARAMETERS, surface.PARAMETERS), np.nan)
 
     def _follow(
         self, kind: Kind, state: motion.TrackedPoints, times: FloatArray, readings: FloatArray
@@ -194,6 +179,10 @@ class LiveReconstructor:
         if reason := _lost(state.fresh[:, 3], usable):
             return _rejected(kind, times, readings, reason, tracking_lost=True)
         fit = self._fit(state, usable, readings)
+        cycle = live_errors.Cycle(self._tracer(readings), state, fit, self._sums(), readings)
+        errors = self._watch.look(cycle)
+        exact = fit.surface.parameters - errors.correction_mm
+        fit = replace(fit, surface=surface.Surface.from_parameters(exact, fit.surface.radius_mm))
         area = math.pi * self._optics.mirror.analysis_radius_mm**2
         quality = Quality(
             modulation_share=modulation_adu / self._full_scale_adu,
@@ -202,7 +191,7 @@ class LiveReconstructor:
             residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
             converged=fit.converged,
         )
-        estimate = self._estimate(kind, fit, quality, times, readings)
+        estimate = self._estimate(kind, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
             self._tracer(readings).start(state.points, state.surface.height)  # back onto the last good surface
         else:
@@ -210,17 +199,19 @@ class LiveReconstructor:
             self._tracked = state
         return estimate
 
+    def _sums(self) -> list[AnyArray]:
+        """Bin sums (N, bins) of the sinusoids of x and of y."""
+        return [self._binner.sums[slots].reshape(self._slots.steps, -1) for slots in self._slots.sinusoids]
+
     def _track_phases(self, state: motion.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
         moved = motion.worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
-        steps = self._slots.steps
-        sums, combined = [], []
-        for axis, slots in enumerate(self._slots.sinusoids):
-            sums.append(self._binner.sums[slots].reshape(steps, -1))
+        combined = []
+        for axis in range(2):
             part = None if motion_um is None else motion_um[axis]
             combined.append(motion.combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
-        phasor.track(sums, state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
+        phasor.track(self._sums(), state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
 
     def _fit(self, state: motion.TrackedPoints, usable: BoolArray, readings: FloatArray) -> reconstruct.Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
@@ -232,14 +223,24 @@ class LiveReconstructor:
         return reconstruct.solve(self._tracer(readings), state.points, state.surface, normal=normal)
 
     def _estimate(
-        self, kind: Kind, fit: reconstruct.Fit, quality: Quality, times: FloatArray, readings: FloatArray
+        self,
+        kind: Kind,
+        fit: reconstruct.Fit,
+        errors: live_errors.CycleErrors,
+        quality: Quality,
+        times: FloatArray,
+        readings: FloatArray,
     ) -> ShapeEstimate:
         """The result in micrometres, with its covariance and verdict."""
         modulation_adu = quality.modulation_share * self._full_scale_adu
         sigmas_rad = [phase.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu) for d in self._shifts_rad]
-        sigma_mm = self._mm_per_rad * np.array(sigmas_rad) / self._bin_px
+        noise_rad2 = np.square(sigmas_rad) / self._bin_px**2
+        # slopes that changed by more than noise: one error for each point that was asked
+        changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
+        changed_rad2 *= fit.weight_sum / max(errors.asked, 1)
         gain = bins.slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
-        covariance = bins.parameter_covariance(fit, gain @ sigma_mm**2)
+        slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
+        covariance = bins.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
         verdict, reason = judge(quality)
@@ -251,7 +252,7 @@ class LiveReconstructor:
             covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
             sag_um=1e3 * fit.surface.sag_mm,
             sag_sigma_um=1e3 * math.sqrt(gradient @ covariance @ gradient),
-            geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._geometry_covariance_mm2 @ gradient),
+            geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._watch.common_mm2 @ gradient),
             displacement_um=_finite_mean(readings),
             slope_residual_urad=quality.residual_urad,
             valid_fraction=quality.valid_fraction,

@@ -133,8 +133,8 @@ class Points:
         weights = np.ones(count) if weights is None else weights
         return cls(np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count))
 
-    def subset(self, keep: BoolArray) -> "Points":
-        """Those points where `keep` is set."""
+    def subset(self, keep: BoolArray | IntArray) -> "Points":
+        """Those points where `keep` is set, or those at these places."""
         return Points(
             np.ascontiguousarray(self.rays[:, keep]),
             np.ascontiguousarray(self.screen_mm[:, keep]),
@@ -185,7 +185,7 @@ class Tracer:
         def run(start: int, stop: int) -> None:
             kernels.intersect(points.rays, points.t_mm, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
 
-        compiled.split(run, points.t_mm.size)
+        compiled.split(run, points.t_mm.size, compiled.FEW)
 
     def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
         """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards the surface."""
@@ -197,7 +197,7 @@ class Tracer:
             fixed = (rays, t, points.screen_mm, points.weights, self._pinhole, self._plane, self._face)
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
-        return np.asarray(np.sum(compiled.split(run, points.t_mm.size), axis=0))
+        return np.asarray(np.sum(compiled.split(run, points.t_mm.size, compiled.FEW), axis=0))
 
     def normal_matrix(self, points: Points) -> NormalMatrix:
         """D^T W D at the points' present places."""
@@ -206,7 +206,9 @@ class Tracer:
             fixed = (points.rays, points.t_mm, points.weights, self._pinhole, _EXCESS, self.radius_mm)
             return np.asarray(kernels.product_sums(*fixed, start, stop))
 
-        return NormalMatrix.from_products(np.sum(compiled.split(run, points.t_mm.size), axis=0), self.radius_mm)
+        return NormalMatrix.from_products(
+            np.sum(compiled.split(run, points.t_mm.size, compiled.FEW), axis=0), self.radius_mm
+        )
 
     def slope_field(self, points: Points, surface: Surface) -> FloatArray:
         """(6, n): x, y in mm, measured dh/dx, dh/dy, fitted dh/dx, dh/dy at the points."""
@@ -217,7 +219,7 @@ class Tracer:
             fixed = (points.rays, points.t_mm, points.screen_mm, self._pinhole, self._plane, self._face)
             kernels.slope_field(*fixed, *shape, out, start, stop)
 
-        compiled.split(run, points.t_mm.size)
+        compiled.split(run, points.t_mm.size, compiled.FEW)
         return out
 
     def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
@@ -229,7 +231,7 @@ class Tracer:
             fixed = (points.rays, points.t_mm, self._pinhole, self._plane, self._face)
             kernels.predict_screen(*fixed, *shape, out, start, stop)
 
-        compiled.split(run, points.t_mm.size)
+        compiled.split(run, points.t_mm.size, compiled.FEW)
         return out
 
     def position_mm(self, points: Points) -> FloatArray:

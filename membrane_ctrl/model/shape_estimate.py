@@ -32,7 +32,8 @@ class ShapeEstimate:
     coeffs_um: FloatArray
     # amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl
     hencky_um: float
-    covariance_um2: FloatArray  # (36, 36) of `coeffs_um`, from pixel noise and the residual of the fit
+    # (36, 36) of `coeffs_um`, for changes: what this cycle does not share with others near its displacement
+    covariance_um2: FloatArray
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
     sag_sigma_um: float  # its standard deviation from `covariance_um2`
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
@@ -44,7 +45,8 @@ class ShapeEstimate:
     reason: str = ""
     latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
     cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
-    # standard deviation of the sag due to the geometry, common to all cycles; NaN if not stated
+    # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur): a part of the sag's
+    # own beside `sag_sigma_um`, none of a change's; NaN if not stated
     geometry_sag_sigma_um: float = float("nan")
     tracking_lost: bool = False  # the phases cannot be tracked from the last cycle: a full one is needed
 

@@ -265,14 +265,14 @@ def _legend(
     """Markdown: the ranges of the maps' colours, and one line per cycle."""
     rows = "\n".join(f"| {name} | {colours[kind]} |" for kind, name in shapes.MAPS.items() if kind in colours)
     reason = f" ({estimate.reason})" if estimate.reason else ""
-    of_geometry = estimate.geometry_sag_sigma_um
-    geometry = f", ± {of_geometry:.3g} µm from geometry" if math.isfinite(of_geometry) else ""
+    shared_um = estimate.geometry_sag_sigma_um
+    shared = f", ± {shared_um:.3g} µm shared by all cycles" if math.isfinite(shared_um) else ""
     return (
         f"| map | colours |\n|---|---|\n{rows}\n\n"
         "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of a map is in its range.\n\n"
         f"- cycle {estimate.cycle}, {estimate.kind}: {estimate.verdict}{for_people(reason)}\n"
         f"- changes are against cycle {reference.cycle}, at {reference.time_s:.0f} s\n"
-        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} µm from noise{geometry}\n"
+        f"- sag {estimate.sag_um / 1e3:.4f} mm ± {estimate.sag_sigma_um:.3f} µm in a change{shared}\n"
         f"- slope residual {estimate.slope_residual_urad:.2f} µrad, {100 * estimate.valid_fraction:.1f} % valid\n"
     )
 
@@ -289,7 +289,7 @@ def _quality(estimate: shape_estimate.ShapeEstimate) -> dict[streams.Stream, lis
 def _changes(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
 ) -> dict[streams.Stream, tuple[list[float], list[float]]]:
-    """Values and variances; these are of the noise of this cycle, as that of the reference shifts all alike."""
+    """Values and variances; these are this cycle's own, as those of the reference shift all alike."""
     change_um, variances_um2 = estimate.coeffs_um - reference.coeffs_um, np.diag(estimate.covariance_um2)
     sag_um = [estimate.sag_um - reference.sag_um, estimate.displacement_um - reference.displacement_um]
     terms = [j - 1 for j in streams.LOW_ORDERS]

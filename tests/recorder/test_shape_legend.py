@@ -18,8 +18,8 @@ from tests.support.synthetic_run import shape_of
 
 def test_both_error_bars_of_the_sag_are_told_apart() -> None:
     shape = shape_of(1.0, 3)
-    assert "± 0.100 µm from noise\n" in _legend(shape, shape, {})  # nothing is stated of the geometry
-    assert "± 0.100 µm from noise, ± 21.8 µm from geometry\n" in _legend(
+    assert "± 0.100 µm in a change\n" in _legend(shape, shape, {})  # nothing is stated of what they share
+    assert "± 0.100 µm in a change, ± 21.8 µm shared by all cycles\n" in _legend(
         replace(shape, geometry_sag_sigma_um=21.84), shape, {}
     )
 

@@ -35,6 +35,7 @@ def step(function: Callable[..., Any]) -> Any:
 
 T = TypeVar("T")
 WORKERS = 2
+FEW = 4096  # points: waking a thread takes longer
 
 
 @cache
@@ -42,8 +43,13 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(WORKERS - 1, thread_name_prefix="metrology")
 
 
-def split(run: Callable[[int, int], T], count: int) -> list[T]:
-    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread takes one."""
+def split(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
+    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread takes one.
+
+    A count below `fewest` is not split.
+    """
+    if count < fewest:
+        return [run(0, count)]
     edges = [count * k // WORKERS for k in range(WORKERS + 1)]
     others = [_pool().submit(run, start, stop) for start, stop in pairwise(edges[1:])]
     first = run(edges[0], edges[1])

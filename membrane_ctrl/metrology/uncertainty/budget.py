@@ -7,7 +7,7 @@ between two sets.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -185,6 +185,15 @@ def vertex_source(bench: TrialBench, sigma_um: float, says: str) -> Source:
     return Source("vertex_um", says, sigma_um, effect[:, None], common=False, paired=False)
 
 
+def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
+    """The bench with the film's bowl deeper by a displacement, and the ring in its place."""
+    deeper_mm, surface = displacement_um * 1e-3, bench.surface
+    bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)
+    surface = Surface.from_parameters(surface.parameters + bowl.parameters, surface.radius_mm)
+    there = replace(bench, surface=surface, vertex_z_mm=bench.vertex_z_mm - deeper_mm)
+    return replace(there, screen_mm=predicted_mm(there, bench.geometry(), surface))
+
+
 def moves_mm(bench: TrialBench) -> FloatArray:
     """Change (2, n) of the screen points per um of the film's displacement."""
     tracer, points = _stand(bench, bench.geometry().geometry)
@@ -218,31 +227,63 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
     return Source("blur_px", "blur of the picture", sigma_px, effect[:, None])
 
 
-def frame_sources(
-    bench: TrialBench, optics: OpticsConfig, shifts_rad: list[FloatArray], film_um: float
-) -> Iterator[Source]:
-    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`.
+@dataclass(frozen=True)
+class FrameEffects:
+    """Changes (36, frames) of the parameters in mm per unit of one frame's error, x frames first."""
 
-    The figure is that of the film's mean position.
+    level: FloatArray  # its light, relative
+    swing: FloatArray  # the amplitude of its fringes and of their harmonics, relative
+    film: FloatArray  # the film's place, um; the figure is that of the mean place
+
+    @property
+    def x_to_y(self) -> FloatArray:
+        """(36,) per um of the film's motion from the x to the y frames."""
+        x, y = np.split(self.film, 2, axis=1)
+        return np.asarray((y.sum(axis=1) - x.sum(axis=1)) / 2)
+
+
+def frame_effects(
+    bench: TrialBench,
+    optics: OpticsConfig,
+    shifts_rad: Sequence[FloatArray] | FloatArray,
+    light: FloatArray | float = 1.0,
+    harmonics: FloatArray | None = None,
+) -> FrameEffects:
+    """The effects of errors of single frames.
+
+    `light` (2, n) is that of the points, and `harmonics` (2, 2) are the second and third of x and of y, all over the
+    fringes' amplitude.
     """
     scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
-    light: list[FloatArray] = []
-    film: list[FloatArray] = []
+    light = np.broadcast_to(light, bench.screen_mm.shape)
+    harmonics = np.zeros((2, 2)) if harmonics is None else harmonics
+    effects: tuple[list[FloatArray], ...] = ([], [], [])
     for axis, shifts in enumerate(shifts_rad):
         angle = bench.screen_mm[axis] / scale + phase.centre_phase_rad(optics.pattern)
         _, cosine, sine = phase.step_weights(shifts)
         for k, shift in enumerate(shifts):
             # the frame's error over the fringes' amplitude turns the phasor
             turned = -scale * (cosine[k] * np.sin(angle) - sine[k] * np.cos(angle))
-            errors = (1 + np.cos(angle + shift)) * LIGHT, -np.sin(angle + shift) * moves[axis] / scale * film_um
-            for effects, error in zip((light, film), errors, strict=True):
+            second, third = (h * np.cos(k * (angle + shift)) for k, h in zip((2, 3), harmonics[axis], strict=True))
+            wave = np.cos(angle + shift) + second + third
+            errors = light[axis], wave, -np.sin(angle + shift) * moves[axis] / scale
+            for effect, error in zip(effects, errors, strict=True):
                 off = np.zeros_like(bench.screen_mm)
                 off[axis] = turned * error
-                effects.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
-    yield Source("light_relative", "light of each frame", LIGHT, np.stack(light, axis=1), False, False)
+                effect.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
+    level, swing, film = (np.stack(effect, axis=1) for effect in effects)
+    return FrameEffects(level, swing, film - film.mean(axis=1, keepdims=True))
+
+
+def frame_sources(
+    bench: TrialBench, optics: OpticsConfig, shifts_rad: Sequence[FloatArray], film_um: float
+) -> Iterator[Source]:
+    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`."""
+    effects = frame_effects(bench, optics, shifts_rad)
+    light = LIGHT * (effects.level + effects.swing)
+    yield Source("light_relative", "light of each frame", LIGHT, light, False, False)
     says = "motion of the film from frame to frame that no laser has told"
-    of_film = np.stack(film, axis=1)
-    yield Source("film_um", says, film_um, of_film - of_film.mean(axis=1, keepdims=True), False, False)
+    yield Source("film_um", says, film_um, film_um * effects.film, False, False)
 
 
 def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float) -> Iterator[Source]:
@@ -251,31 +292,54 @@ def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float
     middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
     noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
-    left = _left_effects(full, inverse)
+    left = _left_in_cells(full, inverse)
     share = max(0.0, 1 - float(np.sum(noise**2)) / max(float(np.sum(left**2)), 1e-300))
     left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
     yield Source("slope_urad", says, left_urad, math.sqrt(share) * left, common=False)
 
 
-def _left_effects(full: FullResult, inverse: FloatArray) -> FloatArray:
-    """Effects (36, patches) on the parameters if the residual slopes are independent from patch to patch only.
+def _left_in_cells(full: FullResult, inverse: FloatArray) -> FloatArray:
+    grid, reach_mm = full.grid, float(full.grid.axis_mm[-1])
+    x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
+    seen = grid.count > 0
+    slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
+    places_mm = np.stack([x[seen], y[seen]])
+    return left_effects(places_mm, grid.count[seen], slopes, reach_mm, full.surface.radius_mm, inverse)
+
+
+def left_effects(
+    places_mm: FloatArray,
+    count: FloatArray,
+    slopes: FloatArray,
+    reach_mm: float,
+    radius_mm: float,
+    inverse: FloatArray,
+) -> FloatArray:
+    """Effects (36, patches) on the parameters if residual slopes are independent from patch to patch only.
 
     The patches are those of the mirror, whatever was seen: two sets of a bench have the same ones.
+
+    Parameters
+    ----------
+    places_mm, slopes : (2, n) arrays
+        Where, and the residual slopes in x and y there.
+    count : (n,) array
+        Points that each of them stands for.
+    reach_mm, radius_mm : float
+        The patches cover a square of this half side; radius of the terms.
+    inverse : (36, 36) array
+        Of the fit's normal matrix.
     """
-    grid, reach_mm = full.grid, float(full.grid.axis_mm[-1])
-    edges = np.searchsorted(grid.axis_mm, np.linspace(-reach_mm, reach_mm, _PATCHES, endpoint=False))
+    column, row = np.clip(((places_mm / reach_mm + 1) / 2 * _PATCHES).astype(int), 0, _PATCHES - 1)
 
-    def summed(cells: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(np.add.reduceat(cells, edges, axis=0), edges, axis=1)).ravel()
+    def summed(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(row * _PATCHES + column, count * values, _PATCHES**2), float)
 
-    count = summed(grid.count)
-    x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
-    radius_mm = full.surface.radius_mm
-    at = [summed(grid.count * place) / np.maximum(count, 1.0) / radius_mm for place in (x, y)]
-    _, of_x, of_y = residuals.basis(at[0], at[1])
-    pulls = (of_x * summed(grid.count * grid.slope_x) + of_y * summed(grid.count * grid.slope_y)) / radius_mm
-    return np.asarray(inverse @ pulls)
+    points = np.maximum(summed(np.ones_like(count)), 1.0)
+    middle = [summed(place) / points / radius_mm for place in places_mm]
+    _, of_x, of_y = residuals.basis(*middle)
+    return np.asarray(inverse @ ((of_x * summed(slopes[0]) + of_y * summed(slopes[1])) / radius_mm))
 
 
 def slope_variance(

@@ -66,7 +66,7 @@ class TrialBench:
         count: int,
     ) -> "TrialBench":
         """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
-        chosen = _spread_evenly(place_px, optics.camera.width_px, count)
+        chosen = spread_evenly(place_px, optics.camera.width_px, count)
         thinning = points.t_mm.size / np.count_nonzero(chosen)
         points = points.subset(chosen)
         column_px, row_px = place_px[:, chosen]
@@ -119,7 +119,7 @@ class TrialBench:
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
 
 
-def _spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
+def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
     """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows and columns alike.
 
     A place is chosen in every set or in none, so that sets of one bench can be compared.
@@ -225,8 +225,7 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
 
 def noise_covariance(bench: TrialBench) -> FloatArray:
     """Covariance (36, 36) in mm^2 of the parameters from the noise of the pixels."""
-    ideal = reconstruct.Fit(bench.surface, bench.normal, (0.0,), True, 0.0, 0.0, float(bench.t_mm.size))
-    return bins.parameter_covariance(ideal, bench.slope_variance())
+    return bins.parameter_covariance(bench.normal, bench.slope_variance())
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
