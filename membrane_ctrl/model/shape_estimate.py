@@ -45,8 +45,8 @@ class ShapeEstimate:
     reason: str = ""
     latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
     cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
-    # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur): a part of the sag's
-    # own beside `sag_sigma_um`, none of a change's; NaN if not stated
+    # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur): a part of the
+    # sag's own beside `sag_sigma_um`, none of a change's; NaN if not stated
     geometry_sag_sigma_um: float = float("nan")
     tracking_lost: bool = False  # the phases cannot be tracked from the last cycle: a full one is needed
 

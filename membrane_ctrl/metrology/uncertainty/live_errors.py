@@ -67,8 +67,8 @@ class LiveErrors:
     ) -> "LiveErrors":
         """Of some points of a cycle, and of the many more that the waves of uneven light need.
 
-        `light` (2, n) is that of the latter over the amplitude of their fringes; `left` (36, k) are the effects of the
-        slopes that the fit leaves.
+        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left` (36, k) the effects of
+        the slopes that the fit leaves.
         """
         frames = budget.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
         vertex = budget.vertex_source(bench, 1.0, "").effects_mm[:, 0]
