@@ -8,6 +8,8 @@ of its own: it can be inverted.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
@@ -29,15 +31,27 @@ def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, 
     return transition, transition @ block[:n, n:]
 
 
-def least_std_um(loop: LoopConfig, twin: TwinConfig) -> float:
-    """Bound in um for the loop's rate and sensors in the twin's scenario."""
+def least_std_um(
+    loop: LoopConfig, twin: TwinConfig, laser: bool = True, optics_um_per_root_hz: float = math.inf
+) -> float:
+    """Bound in um for the loop's rate and sensors in the twin's scenario.
+
+    `optics_um_per_root_hz`: noise of the measured sag times the root of the interval of frames; they count as prompt.
+    """
     (pressure_pa, pressure_s), (air_k, air_s) = SCENARIOS[twin.scenario]
     follow_s = loop.gas_follows_air_s
     # states: ambient pressure, air temperature, gas temperature
     drift = np.array([[-1 / pressure_s, 0, 0], [0, -1 / air_s, 0], [0, 1 / follow_s, -1 / follow_s]])
     diffusion = np.diag([2 * pressure_pa**2 / pressure_s, 2 * air_k**2 / air_s, 0.0])
     centre = np.array([loop.barometer_gain_um_per_pa, 0.0, loop.temperature_gain_um_per_k])
-    readings, noise = [centre], [twin.laser_noise_um**2 + twin.laser_resolution_um**2 / 12]
+    readings: list[Matrix] = []
+    noise: list[float] = []
+    if laser:
+        readings.append(centre)
+        noise.append(twin.laser_noise_um**2 + twin.laser_resolution_um**2 / 12)
+    if math.isfinite(optics_um_per_root_hz):
+        readings.append(centre)
+        noise.append(optics_um_per_root_hz**2 * loop.rate_hz)
     if loop.feedforward_barometer:
         readings.append(np.array([1.0, 0.0, 0.0]))
         noise.append(twin.barometer_noise_pa**2)

@@ -1,7 +1,9 @@
-"""The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`."""
+"""The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`,
+`[estimator]`.
+"""
 
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -225,3 +227,38 @@ class ShapeConfig(Section):
     """Age up to which a shape is used. Raise it with `period_s`, to several periods."""
     disagreement_max_um: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """Largest jump between camera and laser that the trim follows. Raise it for noisier shapes."""
+
+
+class EstimatorConfig(Section):
+    """The estimate of the centre from laser, optics, barometer and thermometer (docs/estimator.md)."""
+
+    process_value: Literal["laser", "estimate"] = "laser"
+    """What the inner loop holds: the laser's reading, or the estimate of the centre. Change it to hold with the
+    optics."""
+    gain_per_s: Annotated[float, Field(gt=0, le=20)] = 8.0
+    """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is uncertain."""
+    pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08
+    """Dead time from command to gas. Change it to what `tune` found."""
+    pump_lag_s: Annotated[float, Field(ge=0, le=10)] = 0.15
+    """Time constant of the pump. Change it to what `tune` found."""
+    laser_noise_um: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """Noise of a laser reading; a hold learns it within a factor of 5. Change it to your laser's."""
+    optics_noise_um: Annotated[float, Field(gt=0, le=100)] = 0.02
+    """Noise of a measured sag beyond the one that its message states. Raise it for optics that tremble."""
+    barometer_noise_pa: Annotated[float, Field(gt=0, le=100)] = 0.05
+    """Noise of the barometer; a hold learns it within a factor of 5. Change it to your barometer's."""
+    thermometer_noise_k: Annotated[float, Field(gt=0, le=10)] = 0.002
+    """Noise of the air thermometer; a hold learns it within a factor of 5. Change it to your thermometer's."""
+    pressure_walk_pa_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.3
+    """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
+    air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
+    """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
+    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.01
+    """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
+    leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.025
+    """Unrest of the leak: a larger one answers a new leak sooner and passes more noise.
+    Change it with the measured peak after a leak."""
+    leak_walk_optics_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.15
+    """The same while the optics are there, whose noise is smaller. Change it likewise."""
+    mount_walk_um_per_root_h: Annotated[float, Field(ge=0, le=100)] = 0.2
+    """Walk of the laser's mount. Change it to your mount's."""

@@ -12,14 +12,23 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from firmware_iface.settings import AravisCameraConfig, Section, UvcCameraConfig
-from membrane_ctrl.config.control import LimitsConfig, LoopConfig, PumpConfig, ResumeConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.config.control import (
+    EstimatorConfig,
+    LimitsConfig,
+    LoopConfig,
+    PumpConfig,
+    ResumeConfig,
+    ShapeConfig,
+    StatesConfig,
+)
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig
 
 __all__ = [
-    "CameraConfig", "Config", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig", "OpticsConfig",
-    "PatternConfig", "PumpConfig", "RecordingConfig", "ResumeConfig", "ShapeConfig", "StatesConfig", "TwinConfig",
+    "CameraConfig", "Config", "EstimatorConfig", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig",
+    "OpticsConfig", "PatternConfig", "PumpConfig", "RecordingConfig", "ResumeConfig", "ShapeConfig", "StatesConfig",
+    "TwinConfig",
 ]  # fmt: skip
 
 
@@ -98,6 +107,7 @@ class Config(Section):
     states: StatesConfig = StatesConfig()
     resume: ResumeConfig = ResumeConfig()
     shape: ShapeConfig = ShapeConfig()
+    estimator: EstimatorConfig = EstimatorConfig()
     optics: OpticsConfig = OpticsConfig()
     devices: DevicesConfig | None = None
     twin: TwinConfig = TwinConfig()

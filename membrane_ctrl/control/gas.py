@@ -176,6 +176,14 @@ def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     return ""
 
 
+def believed_weather(ambient_pressure_pa: float, air_temperature_c: float) -> tuple[float, float]:
+    """The readings, an impossible one as NaN."""
+    return (
+        ambient_pressure_pa if _believed(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
+        air_temperature_c if _believed(air_temperature_c, _TEMPERATURE_C) else math.nan,
+    )
+
+
 def _believed(value: float, within: tuple[float, float]) -> bool:
     return math.isnan(value) or within[0] <= value <= within[1]
 
@@ -201,10 +209,9 @@ class FeedForward:
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
         """Flow in um/s; NaN for a missing quantity."""
         loop = self._loop
-        use_pressure = loop.feedforward_barometer and _believed(ambient_pressure_pa, _PRESSURE_PA)
-        use_temperature = loop.feedforward_temperature and _believed(air_temperature_c, _TEMPERATURE_C)
-        pressure_pa = ambient_pressure_pa if use_pressure else math.nan
-        temperature_c = air_temperature_c if use_temperature else math.nan
+        pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
+        pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
+        temperature_c = temperature_c if loop.feedforward_temperature else math.nan
         pressure_um_per_s = loop.barometer_gain_um_per_pa * self._pressure.update(pressure_pa, dt_s)
         temperature_um_per_s = loop.temperature_gain_um_per_k * self._temperature.update(temperature_c, dt_s)
         return -(pressure_um_per_s + temperature_um_per_s)

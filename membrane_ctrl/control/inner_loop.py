@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
+from membrane_ctrl.control import centre, film_health, filters, gas, pid, pump_drift
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
@@ -23,6 +23,7 @@ class LoopInput:
     displacement_um: float  # laser reading, as read
     ambient_pressure_pa: float  # NaN without a sensor
     air_temperature_c: float
+    estimate: centre.CentreEstimate | None = None  # held instead of the laser, if given
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,9 @@ class InnerLoop:
     a bump.
     """
 
-    def __init__(self, loop: LoopConfig, pump: PumpConfig) -> None:
+    def __init__(self, loop: LoopConfig, pump: PumpConfig, estimate_gain_per_s: float = 0.0) -> None:
         self._loop = loop
+        self._estimate_gain_per_s = estimate_gain_per_s
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = min(loop.flow_max_um_per_s, pump.flow_full_um_per_s)
         self._measured = filters.LowPass(loop.measurement_filter_s)
@@ -114,30 +116,59 @@ class InnerLoop:
         self._leak.pause()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
-        """Run one automatic tick; a reading that is not finite counts as missing (`stale`). `dt_s` must exceed 0."""
+        """Run one automatic tick, on the estimate if there is one; `dt_s` must exceed 0.
+
+        Without either, the reading counts as missing (`stale`).
+        """
         self.learned = False
-        if not math.isfinite(given.displacement_um):
+        if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
-        before_um = self._measured.value
-        filtered_um = self._measured.update(given.displacement_um, dt_s)
-        error_um, ramp_um_per_s = self._follow_setpoint(given, filtered_um, dt_s)
-        rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
-        terms = self._pid.terms(error_um, rate_um_per_s)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
-        wanted_um_per_s = terms.sum_um_per_s + weather_um_per_s + ramp_um_per_s
+        if given.estimate is None:
+            terms, known_um_per_s = self._on_laser(given, dt_s)
+            known_um_per_s += weather_um_per_s
+        else:
+            terms, known_um_per_s = self._on_estimate(given, given.estimate, dt_s)
+        filtered_um = self._measured.value
+        wanted_um_per_s = terms.sum_um_per_s + known_um_per_s
         probing = (
             self.may_probe and self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
         )
         probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
-        self._pid.integrate(dt_s)
+        if given.estimate is None:
+            self._pid.integrate(dt_s)
         fraction = self._command(limited_um_per_s, dt_s)
-        if probing:
+        if probing and math.isfinite(given.displacement_um):
             self.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
         else:
             self._drift.spoil()
         self._leak.update(self._flow(fraction), weather_um_per_s, filtered_um, dt_s)
-        return self._output(terms, weather_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
+        return self._output(terms, known_um_per_s, wanted_um_per_s, fraction, filtered_um)
+
+    def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
+        """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
+        before_um = self._measured.value
+        filtered_um = self._measured.update(given.displacement_um, dt_s)
+        error_um, ramp_um_per_s = self._follow_setpoint(given, filtered_um, dt_s)
+        rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
+        return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
+
+    def _on_estimate(
+        self, given: LoopInput, estimate: centre.CentreEstimate, dt_s: float
+    ) -> tuple[pid.PidTerms, float]:
+        """P on the centre that the gas in transit leads to; the estimated leak is the integrator.
+
+        The prediction takes dead time and lag out of the loop, and the filter, which knows the flow after its limits,
+        cannot wind up. Everything that `_on_laser` needs follows, so that either may take over at any tick.
+        """
+        self._measured.reset(estimate.um)
+        shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
+        self._matched.reset(shaped_um)
+        self._pid.place(estimate.leak_um_per_s)
+        p_um_per_s = self._estimate_gain_per_s * (shaped_um - estimate.ahead_um)
+        terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
+        return terms, estimate.drift_um_per_s - estimate.leak_um_per_s + ramp_um_per_s
 
     def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
@@ -242,6 +273,11 @@ class InnerLoop:
 
     def _follow_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
         """Advance the setpoint; return the loop's error in um and the ramp's own speed in um/s."""
+        shaped_um, speed_um_per_s = self._shape_setpoint(given, filtered_um, dt_s)
+        return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
+
+    def _shape_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
+        """Advance the setpoint; return it as the loop sees it, and its speed in um/s."""
         if math.isnan(self._setpoint_um):
             self._stand_at(filtered_um)
         if math.isnan(self._ramp.value_um):
@@ -254,7 +290,7 @@ class InnerLoop:
         limit_um_per_s = self._loop.setpoint_ramp_um_per_s
         speed_um_per_s = min(max((shaped_um - self._shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
         self._shaped_um = shaped_um
-        return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
+        return shaped_um, speed_um_per_s
 
     def _output(
         self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float, filtered_um: float

@@ -14,6 +14,7 @@ from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller import (
     commands,
+    holders,
     pump_obeys,
     safe_levels,
     safety,
@@ -47,7 +48,7 @@ class Controller:
         self._safety = safety.SafetyTable(config.limits)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
-        loop = inner_loop.InnerLoop(config.loop, config.pump)
+        loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator.gain_per_s)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
         self._scene = Scene(
             config, config.loop, config.pump, loop, observer, levels, standstill, config.loop.setpoint_um
@@ -57,6 +58,7 @@ class Controller:
         self._setpoint_back_um = math.nan  # after a trial that steps the setpoint
         self._shape_back = False  # likewise: the shape loop is on again
         self._consistency = sensor_consistency.SensorConsistency(config)
+        self._holders = holders.Holders(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
         self._tick_error = ""
@@ -113,11 +115,17 @@ class Controller:
             locked=scene.latched,
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
+            optics_hold=self._holders.optics_hold,
+            estimated_um=last.filtered_um,
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
         self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
+        events += self._holders.step(inputs, self.state, scene, last, shape.state, consistency)
+        if (estimate := self._holders.estimate) is not None:
+            shape = replace(shape, trim_um=estimate.mount_um)
+        scene.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
         if math.isnan(self._state_since_s):  # the verdict has just changed the state
             self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
         self._act(events)
@@ -261,6 +269,7 @@ class Controller:
             scene.loop.set_pump(pump)
         scene.loop_config, scene.pump_config = loop, pump
         scene.loop.set_gains(loop)
+        self._holders.set_gains(loop)
         self._shape.set_memory(self._gains.shape_time_constant_s)
         self._step_setpoint()
 

@@ -46,7 +46,14 @@ class Observation:
     gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
     gauge_jumps: int = 0  # consecutive readings that no film can cause
     laser_gauge_apart: str = ""  # readings of laser and gauge, if they contradict each other
+    optics_hold: bool = False  # the optics see the centre: the laser may be missing
+    estimated_um: float = math.nan  # what the laser would read by them
     gas_excess: str = ""  # excess gas the film takes, unless a camera sees it stand still
+
+    @property
+    def depth_um(self) -> float:
+        """The laser's reading, or what it would read while only the optics see the centre."""
+        return self.estimated_um if self.optics_hold and math.isnan(self.displacement_um) else self.displacement_um
 
 
 @dataclass(frozen=True, slots=True)

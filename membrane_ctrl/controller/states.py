@@ -329,6 +329,7 @@ def _given(scene: Scene, target_um: float) -> inner_loop.LoopInput:
         displacement_um=scene.observer.displacement_um,
         ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
         air_temperature_c=reading.air_temperature_c if reading else math.nan,
+        estimate=scene.estimate,
     )
 
 

@@ -122,6 +122,13 @@ class Plausibility(Event, kind="plausibility"):
     seen: str
 
 
+class HeldBy(Event, kind="held_by"):
+    """Which sensors the estimate of the centre follows now, and which of them have jumped."""
+
+    sensors: str
+    jumped: str
+
+
 class Maintenance(Event, kind="maintenance"):
     """Something is wearing out, or will need attention."""
 
@@ -163,6 +170,7 @@ _SENTENCES = {
     "agreement": "Laser and camera agree again[ ({seen})]",
     "maintenance": "Maintenance {name}: {message}",
     "maintenance_over": "Maintenance {name} is over: {message}",
+    "held_by": "The mirror is held by {sensors}[; jumped: {jumped}]",
     "pump": "The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop reckons with {correction:.3f}",
     "link": "Link to the pump board: {message}",
     "latch_written": "The latched fault's file is written again",

@@ -1,0 +1,422 @@
+"""One estimate of the mirror's centre from everything that sees it: a Kalman filter with a memory. Pure.
+
+    centre  c = z + g_p p + g_T T_gas           z: the gas in the mirror, as height of the centre
+    dz/dt   = q - leak                          q: the pump's flow, after dead time and lag
+    dT_gas/dt = (T_air - T_gas) / T_g
+    laser   = c + mount      optics = c - stand      barometer = p      thermometer = T_air
+
+z, leak, p, T_air and mount are random walks; `stand` is what the optics' zero differs from the laser's at lock. A
+frame shows the centre of some time ago: the centre at each of the last ticks is a state of its own (a clone), so a
+late reading is exact, whenever it comes.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from enum import IntEnum
+from itertools import islice
+
+import numpy as np
+
+from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
+from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.gas import believed_weather
+from membrane_ctrl.control.sensor_noise import WalkNoise, Whiteness
+from membrane_ctrl.model.arrays import FloatArray
+
+_GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _STAND = range(7)
+_PLANT = 7  # states before the clones
+CLONES = 64  # 1.3 s at 50 Hz
+_CLONE_S = 0.02  # least time between clones
+_GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain may miss
+_HUBER2, _FAR2, _FAR_COUNT = 9.0, 25.0, 3  # squared sigmas: weighed less beyond the first, dropped beyond the second
+LOCK_FRAMES = 5
+_FRAME_S = 0.05  # interval of frames from which on the optics' own `leak_walk` applies
+_FRAMES_LOST = 3  # after this many missing frames the optics are gone
+_INTERVAL_SHARE = 0.2  # of a new interval in their mean
+_IMPOSSIBLE = 1e4  # um, Pa or K: no film, weather or mount moves that far in a hold
+_UNKNOWN_UM2 = 1e6  # variance of the optics' zero before lock
+_LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the start
+_SHARE_S = 2.0  # memory of the sensors' weights
+_OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
+Rows = tuple[tuple[int, float], ...]  # states and their factors in a reading's expectation
+
+
+class Sensor(IntEnum):
+    """What sees the centre, or what moves it."""
+
+    LASER = 0
+    OPTICS = 1
+    BAROMETER = 2
+    THERMOMETER = 3
+
+
+# How long after its last accepted reading a sensor still counts as seeing the mirror, at most.
+FRESH_S = {Sensor.LASER: 0.5, Sensor.OPTICS: 5.0, Sensor.BAROMETER: 5.0, Sensor.THERMOMETER: 5.0}
+
+
+@dataclass(frozen=True, slots=True)
+class CentreReadings:
+    """Readings of one tick; NaN for missing ones."""
+
+    now_s: float
+    flow_um_per_s: float  # commanded since the last tick
+    laser_um: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    sag_um: float = math.nan
+    sag_sigma_um: float = math.nan
+    sag_time_s: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class SensorView:
+    """One sensor's part in the estimate."""
+
+    fresh: bool  # the estimate follows it
+    innovation: float  # last reading minus expectation, in standard deviations; NaN before the first
+    share: float  # of the corrections of the centre, 0..1
+
+
+@dataclass(frozen=True, slots=True)
+class CentreEstimate:
+    """The centre in um, as the laser would read it without noise.
+
+    Attributes
+    ----------
+    um, sigma_um : float
+        Centre plus mount, and the standard deviation of the centre.
+    mount_um : float
+        Displacement of the laser's mount: the true centre is `um - mount_um`.
+    ahead_um : float
+        Where the gas in transit takes it, if the pump from now on balances `drift_um_per_s`.
+    leak_um_per_s, drift_um_per_s : float
+        Loss of gas, and that less the lift of the warming gas.
+    sensors : tuple of SensorView
+        By `Sensor`.
+    jumped : tuple of str
+        Sensors whose readings have jumped in this tick, in words.
+    """
+
+    um: float
+    sigma_um: float
+    mount_um: float
+    ahead_um: float
+    leak_um_per_s: float
+    drift_um_per_s: float
+    sensors: tuple[SensorView, ...]
+    jumped: tuple[str, ...] = ()
+
+
+class Transit:
+    """Gas between pump and mirror: a dead time, then a lag, in ticks of `period_s`."""
+
+    def __init__(self, delay_s: float, lag_s: float, period_s: float) -> None:
+        self._ticks = int(delay_s / period_s + 1e-9)
+        self._rest = max(0.0, delay_s / period_s - self._ticks)
+        self._delay_s, self._lag_s, self._period_s = delay_s, lag_s, period_s
+        self._flows: deque[float] = deque([0.0] * (self._ticks + 2), maxlen=self._ticks + 2)  # newest first
+        self._arriving = 0.0
+
+    def place(self, flow_um_per_s: float) -> None:
+        """Everything flows at this rate."""
+        self._flows.extend([flow_um_per_s] * len(self._flows))
+        self._arriving = flow_um_per_s
+
+    def advance(self, flow_um_per_s: float, dt_s: float) -> float:
+        """Pump at a rate for a step; returns the rise of the centre in it, um."""
+        for _ in range(max(1, round(dt_s / self._period_s))):
+            self._flows.appendleft(flow_um_per_s)
+        late = (1 - self._rest) * self._flows[self._ticks] + self._rest * self._flows[self._ticks + 1]
+        moved = smoothing(dt_s, self._lag_s) * (late - self._arriving)
+        self._arriving += moved
+        return late * dt_s - self._lag_s * moved
+
+    def coming_um(self, drift_um_per_s: float) -> float:
+        """Rise still to come, if from now on the pump gives the drift."""
+        pending = self._period_s * (sum(islice(self._flows, self._ticks)) + self._rest * self._flows[self._ticks])
+        return pending - drift_um_per_s * self._delay_s + self._lag_s * (self._arriving - drift_um_per_s)
+
+
+@dataclass(slots=True)
+class _Watch:
+    """What the filter knows of one sensor."""
+
+    seen_s: float = -math.inf  # arrival of the last accepted reading
+    taken_s: float = -math.inf  # when it was taken
+    innovation: float = math.nan
+    pull: float = 0.0  # recent sum of gains on the centre
+    far: int = 0  # readings in a row beyond the outer limit
+    far_since_s: float = math.nan
+
+
+@dataclass(slots=True)
+class _Noises:
+    """Noise levels, learned within bounds."""
+
+    laser: WalkNoise
+    barometer: WalkNoise
+    thermometer: WalkNoise
+    centre: Whiteness = field(default_factory=Whiteness)
+
+
+class CentreFilter:
+    """Estimates the centre; `start` it, then call `step` on every tick."""
+
+    def __init__(self, config: EstimatorConfig, loop: LoopConfig) -> None:
+        self._config, self._rate_hz = config, loop.rate_hz
+        self.set_gains(loop)
+        self._every = max(1, round(_CLONE_S * loop.rate_hz))
+        self.start(0.0, 0.0, 0.0)
+
+    def set_gains(self, loop: LoopConfig) -> None:
+        """Take what barometer and thermometer mean for the centre."""
+        self._pressure_gain = loop.barometer_gain_um_per_pa
+        self._warmth_gain = loop.temperature_gain_um_per_k
+        self._gas_follows_air_s = loop.gas_follows_air_s
+        self._uses = (loop.feedforward_barometer, loop.feedforward_temperature)
+
+    def start(self, displacement_um: float, flow_um_per_s: float, mount_um: float) -> None:
+        """Begin at a laser reading, a flow that balances the leak, and a known displacement of the mount."""
+        config, rate_hz = self._config, self._rate_hz
+        self._x: FloatArray = np.zeros(_PLANT + CLONES)
+        self._p: FloatArray = np.zeros((_PLANT + CLONES, _PLANT + CLONES))
+        self._times: FloatArray = np.full(CLONES, -np.inf)
+        self._count = 0
+        self._x[_GAS], self._x[_LEAK], self._x[_MOUNT] = displacement_um - mount_um, flow_um_per_s, mount_um
+        variances = (
+            config.laser_noise_um**2, _LEAK_STD_UM_PER_S**2, _AMBIENT_STD_PA**2, _WARMTH_STD_K**2, _WARMTH_STD_K**2,
+            0.0, _UNKNOWN_UM2,
+        )  # fmt: skip
+        for i, variance in enumerate(variances):
+            self._p[i, i] = variance
+        self._origin = [math.nan, math.nan, math.nan]  # first pressure, air temperature, sag
+        self._watches = [_Watch() for _ in Sensor]
+        self._noises = _Noises(
+            WalkNoise(config.laser_noise_um, 0.1, rate_hz),
+            WalkNoise(config.barometer_noise_pa, config.pressure_walk_pa_per_root_s, rate_hz),
+            WalkNoise(config.thermometer_noise_k, config.air_walk_k_per_root_s, rate_hz),
+        )
+        self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
+        self._transit.place(flow_um_per_s)
+        self._jumped: list[str] = []
+        self.frames = 0  # of the optics since lock
+        self._frame_interval_s = FRESH_S[Sensor.OPTICS]
+        self._last_frame_s = -math.inf
+        self._leak_walk_was = config.leak_walk_um_per_s_per_root_s
+
+    def relock(self) -> None:
+        """Take the optics' next readings as a new zero."""
+        self._p[_STAND] = self._p[:, _STAND] = 0.0
+        self._p[_STAND, _STAND], self._x[_STAND] = _UNKNOWN_UM2, 0.0
+        self._origin[2] = math.nan
+        self.frames = 0
+        self._watches[Sensor.OPTICS] = _Watch()
+
+    def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
+        """One tick: predict, then take what was read. `dt_s` must exceed 0."""
+        self._jumped = []
+        self._predict(given.now_s, given.flow_um_per_s, dt_s)
+        self._clone(given.now_s)
+        for watch in self._watches:
+            watch.pull *= math.exp(-dt_s / _SHARE_S)
+        pressure_pa, air_c = believed_weather(given.ambient_pressure_pa, given.air_temperature_c)
+        noises = self._noises
+        if self._uses[0] and math.isfinite(pressure_pa):
+            pressure_pa = self._from_origin(0, pressure_pa)
+            noises.barometer.update(pressure_pa, dt_s)
+            self._take(Sensor.BAROMETER, ((_AMBIENT, 1.0),), pressure_pa, noises.barometer.variance, given.now_s)
+        if self._uses[1] and math.isfinite(air_c):
+            air_k = self._from_origin(1, air_c)
+            noises.thermometer.update(air_k, dt_s)
+            self._take(Sensor.THERMOMETER, ((_AIR, 1.0),), air_k, noises.thermometer.variance, given.now_s)
+        if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
+            self._take_frame(given)
+        if math.isfinite(given.laser_um):
+            noises.laser.update(given.laser_um, dt_s)
+            rows = (*self._centre_rows(), (_MOUNT, 1.0))
+            self._take(Sensor.LASER, rows, given.laser_um, noises.laser.variance, given.now_s)
+        return self._estimate(given.now_s)
+
+    def _centre_rows(self) -> Rows:
+        return (_GAS, 1.0), (_AMBIENT, self._pressure_gain), (_WARMTH, self._warmth_gain)
+
+    def _from_origin(self, which: int, value: float) -> float:
+        """The value less the first one: numbers stay small."""
+        if math.isnan(self._origin[which]):
+            self._origin[which] = value
+        return value - self._origin[which]
+
+    def _predict(self, now_s: float, flow_um_per_s: float, dt_s: float) -> None:
+        x, p, config = self._x, self._p, self._config
+        follow = smoothing(dt_s, self._gas_follows_air_s)
+        x[_GAS] += self._transit.advance(flow_um_per_s, dt_s) - x[_LEAK] * dt_s
+        x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
+        for matrix in (p, p.T):
+            matrix[_GAS] -= dt_s * matrix[_LEAK]
+            matrix[_WARMTH] += follow * (matrix[_AIR] - matrix[_WARMTH])
+        walk = self._noises.barometer.walk
+        missed = _GAIN_ERROR**2 * self._pressure_gain**2 * walk
+        p[_GAS, _GAS] += dt_s * self._noises.centre.factor * (config.centre_walk_um_per_root_s**2 + missed)
+        leak_walk = self._leak_walk(now_s)
+        if leak_walk < self._leak_walk_was:  # the optics are gone: the leak has not changed as fast as it might have
+            p[_LEAK] *= leak_walk / self._leak_walk_was
+            p[:, _LEAK] *= leak_walk / self._leak_walk_was
+        self._leak_walk_was = leak_walk
+        p[_LEAK, _LEAK] += dt_s * leak_walk**2
+        p[_AMBIENT, _AMBIENT] += dt_s * walk
+        p[_AIR, _AIR] += dt_s * self._noises.thermometer.walk
+        p[_MOUNT, _MOUNT] += dt_s * config.mount_walk_um_per_root_h**2 / 3600.0
+
+    def _leak_walk(self, now_s: float) -> float:
+        """What is taken for a leak's change: more if frequent frames show it than if the laser's noise hides it."""
+        config = self._config
+        if not self._fresh(Sensor.OPTICS, now_s):
+            return config.leak_walk_um_per_s_per_root_s
+        by_optics = config.leak_walk_optics_um_per_s_per_root_s * min(1.0, _FRAME_S / self._frame_interval_s)
+        return max(config.leak_walk_um_per_s_per_root_s, by_optics)
+
+    def _clone(self, now_s: float) -> None:
+        """Remember the centre of this tick in the oldest clone."""
+        self._count += 1
+        if self._count % self._every:
+            return
+        slot = self._count // self._every % CLONES
+        self._times[slot] = now_s
+        slot += _PLANT
+        rows = self._centre_rows()
+        self._p[slot] = sum(share * self._p[i] for i, share in rows)
+        column = sum(share * self._p[:, i] for i, share in rows)
+        self._p[:, slot] = column
+        self._p[slot, slot] = sum(share * self._p[i, slot] for i, share in rows)
+        self._x[slot] = sum(share * self._x[i] for i, share in rows)
+
+    def _take_frame(self, given: CentreReadings) -> None:
+        times, time_s = self._times, given.sag_time_s
+        before, after = np.where(times <= time_s, times, -np.inf), np.where(times > time_s, times, np.inf)
+        early, late = int(before.argmax()), int(after.argmin())
+        if not math.isfinite(before[early]) or time_s > given.now_s:
+            return  # older than the memory, or from the future
+        rows: Rows = ((_PLANT + early, 1.0), (_STAND, -1.0))
+        if math.isfinite(after[late]):
+            share = float((time_s - times[early]) / (times[late] - times[early]))
+            rows = ((_PLANT + early, 1.0 - share), (_PLANT + late, share), (_STAND, -1.0))
+        variance = given.sag_sigma_um**2 + self._config.optics_noise_um**2
+        self._take(Sensor.OPTICS, rows, self._from_origin(2, given.sag_um), variance, given.now_s, time_s)
+        if (interval_s := time_s - self._last_frame_s) > 0:
+            longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - self._frame_interval_s
+            self._frame_interval_s += _INTERVAL_SHARE * longer_s
+        self._last_frame_s = time_s
+        self.frames += 1
+        if self.frames == LOCK_FRAMES:
+            self._lock()
+
+    def _lock(self) -> None:
+        """Declare the figure seen so far the one to hold: what was uncertain of it is the laser's from now on.
+
+        A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's displacement
+        mount + e.
+        """
+        for matrix in (self._p, self._p.T):
+            matrix[_GAS] -= matrix[_STAND]
+            matrix[_MOUNT] += matrix[_STAND]
+            matrix[_PLANT:] -= matrix[_STAND]
+            matrix[_STAND] = 0.0
+
+    def _take(
+        self, sensor: Sensor, rows: Rows, value: float, variance: float, now_s: float, taken_s: float = math.nan
+    ) -> None:
+        """Use one reading, whose expectation is the sum of states times factors, by how well it fits."""
+        taken_s = now_s if math.isnan(taken_s) else taken_s
+        watch, x, p = self._watches[sensor], self._x, self._p
+        innovation = value - sum(factor * x[i] for i, factor in rows)
+        if abs(innovation) > _IMPOSSIBLE:
+            return
+        ph = sum(factor * p[i] for i, factor in rows)
+        spread = sum(factor * ph[i] for i, factor in rows) + variance
+        squared = innovation**2 / spread
+        watch.innovation = float(innovation / math.sqrt(spread))
+        if self._doubted(sensor, squared, taken_s, now_s):
+            return
+        if watch.far:
+            self._open(sensor, float(innovation), now_s)
+            watch.far = 0
+            ph = sum(factor * p[i] for i, factor in rows)
+            spread = sum(factor * ph[i] for i, factor in rows) + variance
+        elif squared > _HUBER2:
+            spread *= squared / _HUBER2
+        gain = ph / spread
+        x += gain * innovation
+        p -= gain[:, None] * ph
+        watch.seen_s, watch.taken_s = now_s, taken_s
+        if sensor in (Sensor.LASER, Sensor.OPTICS):
+            watch.pull += abs(float(sum(share * gain[i] for i, share in self._centre_rows())))
+            if sensor == Sensor.OPTICS or not self._fresh(Sensor.OPTICS, now_s):
+                self._noises.centre.update(float(innovation), float(spread), now_s)
+
+    def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
+        """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a single bad one.
+
+        A laser far off waits for a frame that shows whether film or mount has moved.
+        """
+        watch = self._watches[sensor]
+        if squared <= _FAR2:
+            watch.far = 0
+            return False
+        watch.far_since_s = watch.far_since_s if watch.far else taken_s
+        watch.far += 1
+        waits = sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s)
+        return watch.far < _FAR_COUNT or (waits and self._watches[Sensor.OPTICS].taken_s <= watch.far_since_s)
+
+    def _open(self, sensor: Sensor, innovation: float, now_s: float) -> None:
+        """A sensor has moved and stays there: let the others say whether it moved, or what it sees."""
+        since_s = self._watches[sensor].far_since_s
+        self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
+        if sensor == Sensor.THERMOMETER:
+            self._widen(_AIR, innovation, math.inf, 0.0)
+        elif sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
+            self._widen(_MOUNT, innovation, math.inf, 0.0)
+        elif sensor == Sensor.BAROMETER:
+            self._widen(_AMBIENT, innovation, since_s, self._pressure_gain)
+            self._widen(_GAS, self._pressure_gain * innovation, since_s, 1.0)
+        else:
+            self._widen(_GAS, innovation, since_s, 1.0)
+            if sensor == Sensor.OPTICS and self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far:
+                self._widen(_STAND, _OPTICS_JUMP_SHARE * innovation, math.inf, 0.0)
+
+    def _widen(self, state: int, by: float, since_s: float, on_centre: float) -> None:
+        """A state, and with it the centre since a time, may have jumped by some `by`."""
+        jump = np.zeros_like(self._x)
+        jump[state] = by
+        jump[_PLANT:][self._times >= since_s] = on_centre * by
+        self._p += jump[:, None] * jump
+
+    def _fresh(self, sensor: Sensor, now_s: float) -> bool:
+        limit_s = FRESH_S[sensor]
+        if sensor == Sensor.OPTICS:
+            limit_s = min(limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self._frame_interval_s))
+        return now_s - self._watches[sensor].seen_s <= limit_s
+
+    def _estimate(self, now_s: float) -> CentreEstimate:
+        x, p, rows = self._x, self._p, self._centre_rows()
+        centre_um = sum(share * x[i] for i, share in rows)
+        ph = sum(share * p[i] for i, share in rows)
+        variance = max(0.0, sum(share * ph[i] for i, share in rows))
+        drift = float(x[_LEAK])
+        if self._gas_follows_air_s > 0:
+            drift -= float(self._warmth_gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
+        um = float(centre_um + x[_MOUNT])
+        pulls = sum(watch.pull for watch in self._watches)
+        return CentreEstimate(
+            um=um,
+            sigma_um=math.sqrt(variance),
+            mount_um=float(x[_MOUNT]),
+            ahead_um=um + self._transit.coming_um(drift),
+            leak_um_per_s=float(x[_LEAK]),
+            drift_um_per_s=drift,
+            sensors=tuple(
+                SensorView(self._fresh(sensor, now_s), watch.innovation, watch.pull / pulls if pulls > 0 else 0.0)
+                for sensor, watch in zip(Sensor, self._watches, strict=True)
+            ),
+            jumped=tuple(self._jumped),
+        )

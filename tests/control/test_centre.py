@@ -1,0 +1,363 @@
+"""The estimate of the centre: against a batch solution of its own code, in a second world, with bad sensors."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig
+from membrane_ctrl.control import centre
+from membrane_ctrl.control.centre import CentreEstimate, CentreFilter, CentreReadings, Sensor, Transit
+from membrane_ctrl.control.sensor_noise import WalkNoise, Whiteness
+from tests.support.second_world import ForeignPlant, ForeignPump
+
+LOOP = LoopConfig()
+CONFIG = EstimatorConfig()
+DT_S = 0.02
+FLOW = 1.24
+SAG_UM = 37_100.0
+LASER, OPTICS, BAROMETER = Sensor.LASER, Sensor.OPTICS, Sensor.BAROMETER
+
+
+# Against a batch solution: all states of all ticks as one Gaussian, conditioned on all readings at their true times.
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading of a sum of states at ticks, with its noise."""
+
+    rows: tuple[tuple[int, np.ndarray], ...]
+    value: float
+    variance: float
+
+
+def _model() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transition, noise of a step, first covariance of gas, leak, pressure, air, gas temperature, mount, stand."""
+    step = np.eye(7)
+    step[0, 1] = -DT_S
+    follow = 1 - math.exp(-DT_S / LOOP.gas_follows_air_s)
+    step[4, 3], step[4, 4] = follow, 1 - follow
+    missed = (0.2 * LOOP.barometer_gain_um_per_pa * CONFIG.pressure_walk_pa_per_root_s) ** 2
+    walks = [
+        CONFIG.centre_walk_um_per_root_s**2 + missed,
+        CONFIG.leak_walk_um_per_s_per_root_s**2,
+        CONFIG.pressure_walk_pa_per_root_s**2,
+        CONFIG.air_walk_k_per_root_s**2,
+        0.0,
+        CONFIG.mount_walk_um_per_root_h**2 / 3600,
+        0.0,
+    ]
+    first = np.diag([CONFIG.laser_noise_um**2, 0.09, 1.0, 4e-4, 4e-4, 0.0, 1e6])
+    return step, np.diag(walks) * DT_S, first
+
+
+def _batch(ticks: int, readings: list[Reading], wanted: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of `wanted` states of the last tick, given the readings; the first mean is 0."""
+    step, noise, first = _model()
+    size = 7 * (ticks + 1)
+    whole, last = np.zeros((size, size)), first
+    whole[:7, :7] = first
+    for k in range(1, ticks + 1):
+        now = slice(7 * k, 7 * k + 7)
+        whole[now, : 7 * k] = step @ whole[7 * k - 7 : 7 * k, : 7 * k]
+        whole[: 7 * k, now] = whole[now, : 7 * k].T
+        last = step @ last @ step.T + noise
+        whole[now, now] = last
+    h = np.zeros((len(readings), size))
+    for row, reading in zip(h, readings, strict=True):
+        for tick, factors in reading.rows:
+            row[7 * tick : 7 * tick + 7] += factors
+    spread = h @ whole @ h.T + np.diag([reading.variance for reading in readings])
+    at_end = np.zeros(size)
+    at_end[7 * ticks : 7 * ticks + 7] = wanted
+    gain = np.linalg.solve(spread, h @ whole @ at_end)
+    mean = gain @ np.array([reading.value for reading in readings])
+    return float(mean), float(np.sqrt(at_end @ whole @ at_end - gain @ h @ whole @ at_end))
+
+
+CENTRE = np.array([1.0, 0, LOOP.barometer_gain_um_per_pa, 0, LOOP.temperature_gain_um_per_k, 0, 0])
+MOUNT, STAND = np.eye(7)[5], np.eye(7)[6]
+
+
+@pytest.fixture
+def fixed_noises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is learned."""
+    for learned in (WalkNoise, Whiteness):
+        monkeypatch.setattr(learned, "update", lambda *_: None)
+    monkeypatch.setattr(centre, "FRESH_S", dict.fromkeys(Sensor, -1.0))
+    monkeypatch.setattr(centre, "_HUBER2", math.inf)
+    monkeypatch.setattr(centre, "_FAR2", math.inf)
+
+
+@pytest.mark.usefixtures("fixed_noises")
+@pytest.mark.parametrize("late_ticks", [0, 3, 40], ids=lambda n: f"{n} ticks late")
+def test_it_is_the_best_linear_estimate_of_all_readings_at_their_own_times(late_ticks: int) -> None:
+    """Frames taken every four ticks, some between two ticks, arrive later than what the other sensors said since."""
+    rng, ticks = np.random.default_rng(late_ticks), 64
+    filtered = CentreFilter(CONFIG, LOOP)
+    filtered.start(0.0, FLOW, 0.0)
+    readings: list[Reading] = []
+    until_lock: list[Reading] = []
+    frames = locked_at = 0
+    noises = rng.standard_normal((ticks + 1, 4)) * (1.0, 0.05, 0.002, 0.05)
+    for k in range(1, ticks + 1):
+        laser, pressure, air, frame = noises[k]
+        readings.append(Reading(((k, np.eye(7)[2]),), pressure - noises[1, 1], CONFIG.barometer_noise_pa**2))
+        readings.append(Reading(((k, np.eye(7)[3]),), air - noises[1, 2], CONFIG.thermometer_noise_k**2))
+        taken, sag_um, sag_s = k - late_ticks, math.nan, math.nan
+        if taken >= 1 and taken % 4 == 0:
+            frames += 1
+            between = 0.5 if taken % 8 == 0 and late_ticks else 0.0
+            sag_um, sag_s = SAG_UM + (frame if frames > 1 else 0.0), (taken + between) * DT_S
+            rows: tuple[tuple[int, np.ndarray], ...] = ((taken, (1 - between) * CENTRE - STAND),)
+            if between:
+                rows += ((taken + 1, between * CENTRE),)
+            readings.append(Reading(rows, sag_um - SAG_UM, 0.036**2 + CONFIG.optics_noise_um**2))
+            if frames == centre.LOCK_FRAMES:
+                locked_at, until_lock = k, list(readings)
+        readings.append(Reading(((k, CENTRE + MOUNT),), laser, CONFIG.laser_noise_um**2))
+        given = CentreReadings(k * DT_S, FLOW, laser, 98_000 + pressure, 21 + air, sag_um, 0.036, sag_s)
+        estimate = filtered.step(given, DT_S)
+    stand_um, _ = _batch(locked_at, until_lock, STAND)
+    mean, sigma = _batch(ticks, readings, CENTRE - STAND)
+    assert estimate.um - estimate.mount_um == pytest.approx(mean + stand_um, abs=1e-5)
+    assert estimate.sigma_um == pytest.approx(sigma, rel=1e-4)
+    mount, _ = _batch(ticks, readings, MOUNT + STAND)
+    assert estimate.mount_um == pytest.approx(mount - stand_um, abs=1e-5)
+
+
+# In the second world.
+
+
+def _watch(plant: ForeignPlant, seconds: float, laser: Callable[[float], bool] = lambda _: True) -> np.ndarray:
+    """Run the filter beside a plant whose pump balances the leak, roughly; (n, 3) truth, estimate, sigma."""
+    loop = LoopConfig(
+        barometer_gain_um_per_pa=-0.36, temperature_gain_um_per_k=124.0, gas_follows_air_s=0.0, setpoint_um=0.0
+    )
+    filtered = CentreFilter(EstimatorConfig(pump_delay_s=0.1, pump_lag_s=0.1), loop)
+    rng, frames, rows = np.random.default_rng(5), deque[tuple[float, float]](), []
+    flow = 1.24
+    filtered.start(plant.sample().displacement_um, flow, 0.0)
+    for k in range(round(seconds / DT_S)):
+        now_s, truth = plant.time_s, plant.truth()
+        sample = plant.sample_of(truth)
+        sag = (math.nan, math.nan, math.nan)
+        if k % 3 == 0 and now_s > 3.0:
+            frames.append((now_s, SAG_UM + truth.displacement_um + 0.05 * rng.standard_normal()))
+        if frames and frames[0][0] <= now_s - 0.06:
+            taken_s, sag_um = frames.popleft()
+            sag = (sag_um, 0.05, taken_s)
+        given = CentreReadings(
+            now_s,
+            flow,
+            sample.displacement_um if laser(now_s) else math.nan,
+            sample.ambient_pressure_pa,
+            sample.air_temperature_c,
+            *sag,
+        )
+        estimate = filtered.step(given, DT_S)
+        rows.append((truth.displacement_um, estimate.um - estimate.mount_um, estimate.sigma_um))
+        wanted = 1.24 - 0.5 * (estimate.um - estimate.mount_um) + 0.6 * math.sin(now_s / 3)
+        fraction = 0.1 + 0.9 * max(0.3, min(wanted, 5.3)) / 5.3
+        flow = plant.pump.settled(fraction)
+        plant.actuate(fraction, 0.0)
+        plant.advance(DT_S)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("laser", [True, False], ids=["all", "optics alone"])
+@pytest.mark.parametrize("gusts", [False, True], ids=["calm", "gusts"])
+def test_its_sigma_is_honest_in_a_second_world(laser: bool, gusts: bool) -> None:
+    ratios, misses = [], []
+    for seed in (3,):
+        plant = ForeignPlant(ForeignPump(delay_s=0.1, lag_s=0.1), seed, gusts=gusts)
+        truth, estimate, sigma = _watch(plant, 30.0, lambda now_s: laser or now_s < 5.0)[500:].T
+        miss = estimate - truth
+        miss -= miss.mean()  # the figure at lock is the one to hold
+        ratios.append(np.mean((miss / sigma) ** 2))
+        misses.append(miss.std())
+    assert 0.8 < math.sqrt(np.mean(ratios)) < 1.3
+    assert max(misses) < 0.15  # um; the weather there moves the centre by 0.4 within seconds
+
+
+# Bad sensors.
+
+
+def _still(
+    seconds: float,
+    alter: Callable[[float, CentreReadings], CentreReadings] = lambda _, given: given,
+    filtered: CentreFilter | None = None,
+) -> list[CentreEstimate]:
+    """A mirror that stands still at 0, seen by everything; `alter` changes the readings of a time."""
+    rng = np.random.default_rng(1)
+    if filtered is None:
+        filtered = CentreFilter(CONFIG, LOOP)
+        filtered.start(0.0, FLOW, 0.0)
+    estimates = []
+    for k in range(round(seconds / DT_S)):
+        now_s = k * DT_S
+        laser, pressure, air, frame = (rng.standard_normal(4) * (1.0, 0.05, 0.002, 0.036)).tolist()
+        sag = (SAG_UM + frame, 0.036, now_s - 0.03) if k % 2 else (math.nan, math.nan, math.nan)
+        given = CentreReadings(now_s, FLOW, laser, 98_000.0 + pressure, 21.0 + air, *sag)
+        estimates.append(filtered.step(alter(now_s, given), DT_S))
+    return estimates
+
+
+def _centres(estimates: list[CentreEstimate], from_s: float) -> np.ndarray:
+    """The centre from a time on, against its mean before 6 s: the figure at lock is the one to hold."""
+    um = np.array([estimate.um - estimate.mount_um for estimate in estimates])
+    return um[round(from_s / DT_S) :] - um[round(3.0 / DT_S) : round(6.0 / DT_S)].mean()
+
+
+def _changed(given: CentreReadings, **added: float) -> CentreReadings:
+    values = {name: getattr(given, name) + by for name, by in added.items()}
+    return CentreReadings(**{name: values.get(name, getattr(given, name)) for name in CentreReadings.__slots__})
+
+
+@pytest.mark.parametrize("name", ["laser_um", "sag_um", "ambient_pressure_pa", "air_temperature_c", "sag_sigma_um"])
+def test_single_bad_readings_have_no_effect(name: str) -> None:
+    bad = [20.0, 1e300, math.inf, -math.inf, math.nan]
+
+    def alter(now_s: float, given: CentreReadings) -> CentreReadings:
+        tick = round(now_s / DT_S)
+        return _changed(given, **{name: bad[tick // 10 % 5]}) if now_s > 6 and tick % 10 < 2 else given
+
+    assert np.abs(_centres(_still(8.0, alter), 6.0)).max() < 0.15
+
+
+def test_a_knocked_laser_is_the_mount_s_doing_if_the_optics_see_nothing() -> None:
+    estimates = _still(10.0, lambda now_s, given: _changed(given, laser_um=12.0 if now_s > 6 else 0.0))
+    assert np.abs(_centres(estimates, 6.0)).max() < 0.15
+    assert estimates[-1].mount_um == pytest.approx(12.0, abs=0.5)
+    assert next(jump for estimate in estimates for jump in estimate.jumped).startswith("laser +")
+
+
+def _moved(given: CentreReadings, um: float, at_s: float = 6.0) -> CentreReadings:
+    """What laser and optics read of a film that moved; frames show the film at their own time."""
+    given = _changed(given, laser_um=um if given.now_s > at_s else 0.0)
+    return _changed(given, sag_um=um if given.sag_time_s > at_s else 0.0)
+
+
+@pytest.mark.parametrize("um", [7.0, -1.5])
+def test_a_film_that_moves_is_followed_within_a_few_frames(um: float) -> None:
+    estimates = _still(9.0, lambda _, given: _moved(given, um))
+    assert _centres(estimates, 6.3)[:50] == pytest.approx(um, abs=0.5)
+    assert _centres(estimates, 8.0) == pytest.approx(um, abs=0.4)
+
+
+def test_a_door_that_the_barometer_sees_is_followed_at_once() -> None:
+    by_um = 20 * LOOP.barometer_gain_um_per_pa
+    estimates = _still(
+        7.0, lambda now_s, given: _moved(_changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0), by_um)
+    )
+    assert _centres(estimates, 6.08) == pytest.approx(by_um, abs=1.5)
+    assert _centres(estimates, 6.3) == pytest.approx(by_um, abs=0.25)
+
+
+def test_a_false_door_is_undone() -> None:
+    estimates = _still(8.0, lambda now_s, given: _changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0))
+    assert np.abs(_centres(estimates, 6.3)).max() < 0.25
+
+
+def test_a_jump_of_the_optics_is_undone_by_the_laser() -> None:
+    estimates = _still(12.0, lambda _, given: _changed(given, sag_um=8.0 if given.sag_time_s > 6 else 0.0))
+    assert np.abs(_centres(estimates, 11.0)).max() < 0.5
+
+
+def test_a_drifting_mount_does_not_move_the_centre() -> None:
+    drifting = lambda now_s, given: _changed(given, laser_um=now_s * 2.0 / 60)  # noqa: E731
+    estimates = _still(60.0, drifting)
+    assert np.abs(_centres(estimates, 5.0)).max() < 0.12
+    assert estimates[-1].mount_um == pytest.approx(2.0, abs=1.6)
+
+
+def test_each_sensor_alone_and_none() -> None:
+    nothing = {"laser_um": math.nan, "sag_um": math.nan}
+    lost = _still(20.0, lambda now_s, given: _changed(given, **(nothing if now_s > 8 else {})))
+    assert lost[-1].sigma_um > 5 * lost[350].sigma_um  # it says that it does not know
+    assert [lost[-1].sensors[sensor].fresh for sensor in (LASER, OPTICS, BAROMETER)] == [False, False, True]
+    blind = _still(20.0, lambda now_s, given: _changed(given, laser_um=math.nan if now_s > 8 else 0.0))
+    assert blind[-1].sensors[OPTICS].share > 0.99
+    assert blind[-1].sigma_um < 0.05
+    no_camera = _still(8.0, lambda _, given: _changed(given, sag_um=math.nan))
+    assert no_camera[-1].sensors[LASER].share == pytest.approx(1.0)
+    assert abs(no_camera[-1].um) < 4 * no_camera[-1].sigma_um
+
+
+def test_random_rubbish_never_makes_it_infinite() -> None:
+    rng = np.random.default_rng(9)
+    rubbish = [math.nan, math.inf, -math.inf, 1e308, -1e308, 0.0, 1e-308, 4e3]
+
+    def alter(_: float, given: CentreReadings) -> CentreReadings:
+        values = {name: getattr(given, name) for name in CentreReadings.__slots__}
+        for name in list(values)[2:]:
+            if rng.random() < 0.4:
+                values[name] = float(rng.choice(rubbish))
+        return CentreReadings(**values)
+
+    for estimate in _still(20.0, alter):
+        assert all(map(math.isfinite, (estimate.um, estimate.sigma_um, estimate.ahead_um, estimate.drift_um_per_s)))
+
+
+def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
+    filtered = CentreFilter(CONFIG, LOOP)
+    filtered.start(0.0, FLOW, 0.0)
+    before = _still(6.0, filtered=filtered)
+    filtered.relock()
+    after = _still(6.0, lambda _, given: _changed(given, now_s=6.0, sag_time_s=6.0, sag_um=500.0), filtered)
+    centres = [estimate.um - estimate.mount_um for estimate in (before[-1], *after)]
+    assert np.ptp(centres) < 0.2
+
+
+# Gas in transit.
+
+
+@pytest.mark.parametrize(("delay_s", "lag_s"), [(0.08, 0.15), (0.0, 0.1), (0.05, 0.0), (0.013, 0.3)])
+def test_transit_is_a_dead_time_and_a_lag(delay_s: float, lag_s: float) -> None:
+    """Against a simulation in steps of 1 ms; what is under way arrives, to the last bit."""
+    flows = np.random.default_rng(2).uniform(0, 5, 20)
+    transit, fine = Transit(delay_s, lag_s, DT_S), deque([0.0] * (round(delay_s / 0.001) + 1))
+    arriving = risen = expected = 0.0
+    for k in range(400):
+        flow = float(flows[k // 5]) if k < 100 else 0.0
+        risen += transit.advance(flow, DT_S)
+        if k == 99:
+            coming = transit.coming_um(0.0)
+            at_100 = risen
+        for _ in range(20):
+            fine.append(flow)
+            fine.popleft()
+            share = -math.expm1(-0.001 / lag_s) if lag_s else 1.0
+            arriving += share * (fine[0] - arriving)
+            expected += arriving * 0.001
+        assert risen == pytest.approx(expected, abs=0.02)
+    assert coming == pytest.approx(risen - at_100, abs=1e-5)
+
+
+# Noise levels.
+
+
+@pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.05), (0.05, 1.0), (0.15, 0.3), (0.02, 0.3)])
+def test_noise_and_walk_are_learned(noise: float, walk: float) -> None:
+    rng, learned = np.random.default_rng(4), WalkNoise(0.05, 0.3, 50.0)
+    values = np.cumsum(walk * math.sqrt(DT_S) * rng.standard_normal(20_000)) + noise * rng.standard_normal(20_000)
+    for value in values.tolist():
+        learned.update(value, DT_S)
+    assert math.sqrt(learned.walk) == pytest.approx(walk, rel=0.35)
+    assert math.sqrt(learned.variance) == pytest.approx(noise, rel=0.35 if walk < 1 else 1.5)
+
+
+def test_learned_noise_stays_within_its_bounds() -> None:
+    learned = WalkNoise(0.05, 0.3, 50.0)
+    for k in range(20_000):
+        learned.update(1e3 * (k % 2), DT_S)
+    assert learned.variance <= 0.05**2 * 25 * 1.001
+    for _ in range(50_000):
+        learned.update(0.0, DT_S)
+    assert learned.variance >= 0.05**2 / 25 * 0.999
+    assert learned.walk >= 0.3**2 / 900 * 0.999
