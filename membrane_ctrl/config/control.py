@@ -260,5 +260,5 @@ class EstimatorConfig(Section):
     Change it with the measured peak after a leak."""
     leak_walk_optics_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.15
     """The same while the optics are there, whose noise is smaller. Change it likewise."""
-    mount_walk_um_per_root_h: Annotated[float, Field(ge=0, le=100)] = 0.2
-    """Walk of the laser's mount. Change it to your mount's."""
+    mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
+    """Walk of the laser's mount: 0.2 um in an hour. Change it to your mount's."""

@@ -266,7 +266,7 @@ class CentreFilter:
         p[_LEAK, _LEAK] += dt_s * leak_walk**2
         p[_AMBIENT, _AMBIENT] += dt_s * walk
         p[_AIR, _AIR] += dt_s * self._noises.thermometer.walk
-        p[_MOUNT, _MOUNT] += dt_s * config.mount_walk_um_per_root_h**2 / 3600.0
+        p[_MOUNT, _MOUNT] += dt_s * config.mount_walk_um_per_root_s**2
 
     def _leak_walk(self, now_s: float) -> float:
         """What is taken for a leak's change: more if frequent frames show it than if the laser's noise hides it."""

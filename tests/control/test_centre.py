@@ -49,7 +49,7 @@ def _model() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         CONFIG.pressure_walk_pa_per_root_s**2,
         CONFIG.air_walk_k_per_root_s**2,
         0.0,
-        CONFIG.mount_walk_um_per_root_h**2 / 3600,
+        CONFIG.mount_walk_um_per_root_s**2,
         0.0,
     ]
     first = np.diag([CONFIG.laser_noise_um**2, 0.09, 1.0, 4e-4, 4e-4, 0.0, 1e6])
