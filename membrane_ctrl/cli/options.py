@@ -53,7 +53,9 @@ def configured(path: Path | None) -> "Config":
     doors = config.doors
     if doors.mqtt is not None:
         doors = doors.model_copy(update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")})
-    return config.model_copy(update={"optics": optics, "port": port, "alarms": alarms, "doors": doors})
+    web = config.web and _beside(config.web, folder, "users_file", "certificate_file", "key_file")
+    update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors, "web": web}
+    return config.model_copy(update=update)
 
 
 def _beside(section: S, folder: Path, *names: str) -> S:

@@ -52,6 +52,36 @@ class PortConfig(Section):
         return Path(self.socket) if self.socket else logs_dir / SOCKET_NAME
 
 
+class WebConfig(Section):
+    """The page (docs/web.md), which a hold with this table starts and keeps alive."""
+
+    host: str = LOCAL
+    """Address to listen on. Change it to let other machines connect, with TLS and users."""
+    port: Annotated[int, Field(ge=1, le=65535)] = 7480
+    """TCP port. Change it if another program has it."""
+    names: tuple[str, ...] = ()
+    """Host names by which browsers call it. Set them where it is not the host above."""
+    users_file: str | None = None
+    """Names, roles and passwords of `web add-user`. Set it for a login instead of a link."""
+    certificate_file: str | None = None
+    """TLS certificate of the page. Set it for other machines."""
+    key_file: str | None = None
+    """The key of that certificate. Set it to a file that only the hold's user can read."""
+
+    @property
+    def secure(self) -> bool:
+        """Whether it is served over TLS."""
+        return self.certificate_file is not None and self.key_file is not None
+
+    @model_validator(mode="after")
+    def _closed_to_strangers(self) -> "WebConfig":
+        if self.host not in LOCAL_HOSTS and not (self.secure and self.users_file):
+            raise ValueError(
+                f"host {self.host}: other machines need TLS and a login; give a certificate, its key and users"
+            )
+        return self
+
+
 class MqttConfig(Section):
     """The broker that gets the published values."""
 

@@ -23,7 +23,7 @@ from membrane_ctrl.config.control import (
 )
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig
+from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig, WebConfig
 
 __all__ = [
     "CameraConfig", "Config", "EstimatorConfig", "GeometryConfig", "LimitsConfig", "LoopConfig", "MirrorConfig",
@@ -115,6 +115,7 @@ class Config(Section):
     port: PortConfig = PortConfig()
     alarms: AlarmsConfig = AlarmsConfig()
     doors: DoorsConfig = DoorsConfig()
+    web: WebConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
@@ -126,6 +127,8 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
+        if self.web is not None and not self.port.enabled:
+            raise ValueError("web: the page asks the control port: set port.enabled = true")
         if self.devices is not None and isinstance(self.devices.camera, AravisCameraConfig | UvcCameraConfig):
             bits = self.devices.camera.bits
             if bits != self.optics.camera.bits:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model import clock, events, run_events, telemetry
-from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.child import Child, Program, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
 # Restarting does not help a child that ends more often
@@ -21,7 +22,7 @@ _HOUR_S = 3600.0
 # Until the first report: the interpreter may start on a busy machine
 _STARTS_S = 60.0
 
-Make = Callable[[int], tuple[Child, Connection]]
+Make = Callable[[int], tuple[Child | Program, Connection]]
 
 
 class ManagedChild:
@@ -29,11 +30,13 @@ class ManagedChild:
 
     A child reports about once a second that it is alive, and how long it may now be silent (`run_events.Alive`). A
     stopped or hung child breaks that promise and is killed. `make` gets the number of earlier children and returns
-    the next one, not yet started, with our end of its pipe.
+    the next one, not yet started, with our end of its pipe. A program reports nothing (`reports` is false): only its
+    end is noticed.
     """
 
-    def __init__(self, make: Make) -> None:
+    def __init__(self, make: Make, reports: bool = True) -> None:
         self._make = make
+        self._starts_s = _STARTS_S if reports else math.inf
         self._replaced_s: deque[float] = deque()
         self._count = 0
         self._ended_s: float | None = None
@@ -44,7 +47,7 @@ class ManagedChild:
 
     def start(self, now_s: float) -> None:
         """Start the first child."""
-        self._expected_s = now_s + _STARTS_S
+        self._expected_s = now_s + self._starts_s
         self.child.start()
 
     def send(self, word: str) -> bool:
@@ -85,7 +88,7 @@ class ManagedChild:
         self._count += 1
         self._replaced_s.append(now_s)
         self._ended_s, self._given_up, self._silent = None, False, False
-        self._expected_s = now_s + _STARTS_S
+        self._expected_s = now_s + self._starts_s
         self.child, self._line = self._make(self._count)
         self.child.start()
 
@@ -160,7 +163,7 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, console, acquisition and alarms of one run. The hold continues without them and reports it."""
+    """Recorder, console, acquisition, alarms and page of one run. The hold continues without them and reports it."""
 
     def __init__(
         self,
@@ -198,10 +201,15 @@ class ChildProcesses:
 
             alarms = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run_dir.name)
             self._alarms = ManagedChild(_makes("alarms", "alarms", 5, lambda n: alarms))
+        self._page = None
+        if config.web is not None and socket is not None:
+            words = _page_words(config.web, run_dir, socket)
+            self._page = ManagedChild(lambda _: (Program("page", words, run_dir / "web.log", 10), pipe()[0]), False)
 
     @property
     def _managed(self) -> list[ManagedChild]:
-        return [each for each in (self._recorder, self._acquisition, self._alarms, self._console) if each is not None]
+        found = (self._recorder, self._acquisition, self._alarms, self._console, self._page)
+        return [each for each in found if each is not None]
 
     @property
     def names(self) -> list[str]:
@@ -253,6 +261,15 @@ class ChildProcesses:
             console.stop(0.0)
         if console.exit_code != 0:
             give_back_terminal(self._keyboard)
+
+
+def _page_words(page: WebConfig, run_dir: Path, socket: Path) -> list[str]:
+    """The command line of the page."""
+    options = {"--users": page.users_file, "--certificate": page.certificate_file, "--key": page.key_file}
+    given = [word for option, file in options.items() if file is not None for word in (option, file)]
+    given += [word for name in page.names for word in ("--name", name)]
+    where = ["--logs", str(run_dir.parent), "--socket", str(socket), "--host", page.host, "--port", str(page.port)]
+    return ["web", "--with-hold", *where, *given]
 
 
 def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:

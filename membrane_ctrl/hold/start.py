@@ -7,12 +7,11 @@ state comes first, then the recording, then the rest.
 import asyncio
 import contextlib
 import gc
+import importlib.util
 import json
 import math
-import os
 import shlex
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -72,6 +71,8 @@ def hold_mirror(options: HoldOptions) -> int:
     if options.config.devices is not None and (options.lab or not options.twin):
         open_bench(options.config.devices)  # impossible settings end here, before anything is started
     require_sendable(options.config.alarms)
+    if options.config.web is not None and importlib.util.find_spec("nicegui") is None:
+        raise errors.InputError("[web] needs NiceGUI: pip install 'membrane-ctrl[web]'")
     geometry = geometry_in_force(options.config)
     clock = RunClock.start()
     # SIGTERM before and after the ticks cleans up as well
@@ -115,20 +116,9 @@ def _autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
     """
     words = ["--short", "--wait", "--choose", "same-load", "--name", "autotune", "--reason", "hold --autotune"]
     where = ["--socket", str(socket), "--run", str(run_dir), "--logs", str(run_dir.parent)]
-    program = [sys.executable, "-m", "membrane_ctrl", "tune", "run", *words, *where]
-    with (run_dir / "autotune.log").open("wb") as log:
-        process = subprocess.Popen(program, stdin=subprocess.DEVNULL, stdout=log, stderr=log, process_group=0)
-    os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
-
-    def end() -> None:
-        process.terminate()
-        try:
-            process.wait(_ENDS_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-    return end
+    session = child.Program("autotune", ["tune", "run", *words, *where], run_dir / "autotune.log", _NICE)
+    session.start()
+    return partial(session.stop, _ENDS_S)
 
 
 def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fault.LatchedFile | None:

@@ -16,8 +16,6 @@ app = typer.Typer(
     help="Serve a page that shows the hold and sends commands to it.",
 )
 
-LOCAL = "127.0.0.1"
-
 
 @app.callback()
 def web(
@@ -25,23 +23,34 @@ def web(
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the runs.")] = Path("logs"),
     socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
     run: Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")] = None,
-    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = LOCAL,
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
     name: Annotated[list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")] = None,
     users: Annotated[Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")] = None,
     certificate: Annotated[Path | None, typer.Option("--certificate", help="TLS certificate of the page.")] = None,
     key: Annotated[Path | None, typer.Option("--key", help="Key of that certificate.")] = None,
+    with_hold: Annotated[bool, typer.Option("--with-hold", hidden=True)] = False,
 ) -> None:
     """Serve the page until interrupted; without users, print a link that lets its holder in."""
     if context.invoked_subcommand is not None:
         return
+    from membrane_ctrl.config.port import WebConfig
+    from membrane_ctrl.config.toml_file import parse
+    from membrane_ctrl.control_port.ctl import Where
+    from membrane_ctrl.processes.child import end_with_parent
+
     try:
-        from membrane_ctrl.web.server import WebOptions, serve
+        from membrane_ctrl.web.server import serve
     except ModuleNotFoundError as error:
         if error.name != "nicegui":
             raise
         raise errors.InputError("web needs NiceGUI: pip install 'membrane-ctrl[web]'") from None
-    serve(WebOptions(logs, socket, run, host, port, tuple(name or ()), users, certificate, key))
+    given = {"host": host, "port": port, "names": tuple(name or ())}
+    kept = {"users_file": users, "certificate_file": certificate, "key_file": key}
+    page = parse(given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web")
+    if with_hold:
+        end_with_parent()
+    serve(Where(socket, run, logs=logs), page)
 
 
 @app.command("add-user")

@@ -144,3 +144,17 @@ def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> No
     agency.theirs[-1].send(Alive(5.0).to_dict())
     managed.look(1208.0)
     assert kinds(managed.look(1214.0)) == ["child_silent"]
+
+
+def test_a_program_may_be_silent_and_its_end_is_told_once() -> None:
+    agency = Agency()
+    page = ManagedChild(agency.make, reports=False)
+    page.start(0.0)
+    assert page.look(1e6) == []
+    page.child.kill()
+    assert kinds(page.look(1e6)) == ["child_ended", "child_restarted"]
+    assert page.look(1e6 + 3000.0) == []
+    page.child.kill()
+    assert kinds(page.look(1e6 + 3001.0)) == ["child_ended"]
+    assert page.look(1e6 + 3001.5) == []
+    assert kinds(page.look(1e6 + 3010.0)) == ["child_restarted"]

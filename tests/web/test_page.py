@@ -8,14 +8,16 @@ import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
+from typer.testing import CliRunner
 
+from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.web import panels, server
+from membrane_ctrl.web import cli, panels, server
 from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import CHROMIUM, Tab, browser_tab
@@ -90,14 +92,18 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
 
 
 def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
-    options = server.WebOptions(tmp_path, None, None, "0.0.0.0", 7480, (), None, None, None)
-    with pytest.raises(InputError, match="other machines need TLS and a login"):
-        server.accounts_of(options)
-    assert server.accounts_of(replace(options, host="127.0.0.1")).users == {}
+    done = CliRunner().invoke(cli.app, ["--host", "0.0.0.0", "--logs", str(tmp_path)])
+    assert isinstance(done.exception, InputError)
+    assert "host 0.0.0.0: other machines need TLS and a login" in str(done.exception)
+    files = {"certificate_file": "c", "key_file": "k"}
+    with pytest.raises(ValidationError, match="need TLS and a login"):
+        WebConfig(host="0.0.0.0", **files)
+    WebConfig(host="0.0.0.0", users_file="users", **files)
+    assert server.accounts_of(WebConfig()).users == {}
     empty = tmp_path / "users"
     empty.write_text("")
     with pytest.raises(InputError, match="no users; add one with"):
-        server.accounts_of(replace(options, users=empty))
+        server.accounts_of(WebConfig(users_file=str(empty)))
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "../secret", "a/b", ".hidden"])
