@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import importlib.util
 import signal
 import sys
@@ -35,6 +34,8 @@ def doors(
     """Serve until interrupted."""
     if context.invoked_subcommand is not None:
         return
+    import asyncio
+
     from membrane_ctrl.cli.options import configured
     from membrane_ctrl.doors.names import Door
 
@@ -55,6 +56,8 @@ def names() -> None:
 
 
 async def _serve(door: Door) -> None:
+    import asyncio
+
     opened = _opened(door)
     main = asyncio.current_task()
     assert main is not None
