@@ -131,6 +131,12 @@ def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]
     lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}
     if pattern.role in ("white", "black"):
         return np.outer(lit["y"], lit["x"]) * np.float32(pattern.role == "white")
+    if pattern.role == "crossed":
+        period_mm = 2 * raster.half_side_mm / pattern.index
+        for axis, shift_rad in (("x", pattern.shift_rad), ("y", pattern.shift_y_rad)):
+            wave = _profile(Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm)
+            lit[axis] = 0.5 * wave.astype(np.float32)
+        return np.add.outer(lit["y"], lit["x"]) * np.outer(inside["y"], inside["x"])
     profile = _profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
     lit[pattern.axis] *= profile.astype(np.float32)
     return np.outer(lit["y"], lit["x"])

@@ -33,16 +33,26 @@ class Reconstructor(Protocol):
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
 
     def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
-        """Figure from the sinusoids alone, tracked against the last absolute phase."""
+        """Figure from the frames after a full cycle alone, tracked against the last absolute phase."""
 
 
 @dataclass(frozen=True, slots=True)
 class CyclePlan:
-    """The patterns of both kinds of cycle, in order, and the least time between exposures."""
+    """The patterns of both kinds of cycle, in order, and the least time between exposures.
+
+    `standing` gives the crossed pattern of the moment where one frame of it takes the place of `fringes`.
+    """
 
     full: Sequence[Pattern]
     fringes: Sequence[Pattern]
     frame_interval_s: float
+    standing: Callable[[], Pattern] | None = None
+
+    def patterns(self, full: bool) -> Sequence[Pattern]:
+        """Of the next cycle."""
+        if full:
+            return self.full
+        return self.fringes if self.standing is None else [self.standing()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +129,7 @@ class ShapeCycle:
             self._full_next = True
 
     def _measure(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
-        patterns = self._plan.full if kind == "full" else self._plan.fringes
+        patterns = self._plan.patterns(kind == "full")
         frames = self._exposures.take(patterns, self._cycle, self._stopping)
         if frames is None:
             return None
@@ -130,7 +140,7 @@ class ShapeCycle:
         with exposures.during("reconstruction"):
             reconstruct = self._reconstructor.full if kind == "full" else self._reconstructor.fringes
             estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
-        return replace(estimate, latency_s=self._clock.now() - arrived_s, cycle=self._cycle)
+        return replace(estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle)
 
 
 # The laser's displacement during a frame's exposure, from the control process's telemetry.

@@ -87,6 +87,7 @@ class Exposures:
         self._looks_ahead = isinstance(screen, SettlingScreen)
         self._frames, self._clock, self._laser = frames, clock, laser
         self._interval_s = interval_s
+        self._shown: Pattern | None = None
 
     def take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
         """Take frames of these patterns, in order; None if `stopping` before an exposure.
@@ -95,6 +96,9 @@ class Exposures:
         """
         try:
             return self._take(patterns, cycle, stopping)
+        except StageError:
+            self._shown = None
+            raise
         finally:
             if isinstance(self._camera, _Grabbing):  # frames left by a cycle that ended early
                 self._camera.forget()
@@ -106,8 +110,7 @@ class Exposures:
         for pattern in patterns:
             if stopping():
                 return None
-            with during("screen"):
-                self._screen.begin(pattern)
+            self._show(pattern)
             if pending is not None:
                 taken.append(self._store(*pending, cycle, then=pattern))
                 exposed_s = taken[-1].time_s
@@ -121,10 +124,16 @@ class Exposures:
         if pending is not None:
             ahead = patterns[0] if self._looks_ahead else None  # both kinds of cycle start with the same pattern
             if ahead is not None:
-                with during("screen"):
-                    self._screen.begin(ahead)
+                self._show(ahead)
             taken.append(self._store(*pending, cycle, then=ahead))
         return taken
+
+    def _show(self, pattern: Pattern) -> None:
+        """Send a pattern to the screen, unless it stands there."""
+        if pattern != self._shown:
+            with during("screen"):
+                self._screen.begin(pattern)
+            self._shown = pattern
 
     def _store(self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None) -> Frame:
         """Fetch the exposure of `pattern` into its slot; the screen shows `then` before and after."""

@@ -12,6 +12,7 @@ from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, scr
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
+from membrane_ctrl.metrology.track.live import crossed_patterns
 
 # Before the first cycle, the camera measures exposure, checkerboard, settle time and response of the display.
 
@@ -143,8 +144,17 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
         )
     except ValueError as error:
         raise roles.LinkError(f"devices.screen: {error}") from None
-    shown = screen_pygame.ScreenSettings(raster, full_sequence(pattern), screen.display)
+    patterns = full_sequence(pattern)
+    if config.shape.mode == "track":
+        patterns += crossed_patterns(config.shape.track_periods)
+    shown = screen_pygame.ScreenSettings(raster, patterns, screen.display)
     return OpticalBench(camera, screen_pygame.PygameScreen(shown, now=clock.now, sleep=clock.sleep))
+
+
+def exposure_s(config: Config) -> float:
+    """Exposure time of a frame; 0 for cameras that do not state it."""
+    camera = config.devices.camera if config.devices is not None else None
+    return camera.exposure_ms / 1e3 if isinstance(camera, settings.AravisCameraConfig) else 0.0
 
 
 def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -> Any:

@@ -86,6 +86,8 @@ class RawFrames:
         """Keep the frames of a finished cycle if they are due."""
         self._collect()
         self.look_for_fault()
+        if estimate.kind == "track":
+            return
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
             return
         due = self._recording.raw_every_cycles and estimate.cycle % self._recording.raw_every_cycles == 0
@@ -114,7 +116,7 @@ class RawFrames:
         message = self._telemetry.latest()
         fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
-            cycles = sorted({head.cycle for head in self._frames.heads()})
+            cycles = sorted({head.cycle for head in self._frames.heads() if head.pattern in self._patterns})
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:
                 self._keep(cycle)
         self._in_fault = fault

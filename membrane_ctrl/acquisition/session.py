@@ -3,7 +3,7 @@
 import signal
 import time
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, 
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
+from membrane_ctrl.metrology.track.live import LiveTracker
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
@@ -92,13 +93,13 @@ def warm_up(
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
     # displacements that differ by more than noise trigger the kernels that correct the film's motion
     still, moving = np.zeros(1), np.array([-10.0, 10.0])
-    for patterns, reconstruct, motion_um in (
-        (plan.full, reconstructor.full, moving),
-        (plan.fringes, reconstructor.fringes, moving),
-        (plan.fringes, reconstructor.fringes, still),
+    for full, reconstruct, motion_um in (
+        (True, reconstructor.full, moving),
+        (False, reconstructor.fringes, moving),
+        (False, reconstructor.fringes, still),
     ):
         taken = []
-        for pattern in patterns:
+        for pattern in plan.patterns(full):
             bench.screen.show(pattern)
             taken.append(bench.camera.grab().pixels)
         displacement_um = position.displacement_um + np.resize(motion_um, len(taken))
@@ -135,10 +136,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     config, clock = spec.config, WaitingClock(spec.clock)
     geometry = file.geometry_of_run(spec.run_dir, config)
     remote.tell(worker.geometry_event(geometry))
-    pattern = geometry.optics.pattern
-    plan = cycle.CyclePlan(
-        phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s
-    )
+    plan = _plan(config, geometry.optics)
     with ExitStack() as stack:
         if spec.truth is None:
             bench = optical_bench.configured_bench(config, clock)
@@ -151,7 +149,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
             _open(bench, config, clock, remote)
         if remote.stop:
             return
-        reconstructor = _reconstructor(spec, geometry.optics)
+        reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
         drift = worker.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
@@ -176,14 +174,33 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
         remote.prepared()
         remote.report("running", "first cycle")
-        worker.keep_cycling(taking, remote, publish, clock, config.shape.period_s, keep)
+        worker.keep_cycling(taking, remote, publish, clock, period_s, keep)
 
 
-def _reconstructor(spec: process.AcquisitionSpec, optics: OpticsConfig) -> live.LiveReconstructor:
-    """What makes figures of the frames, with their covariance if the uncertainty of the geometry is stated."""
+def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
+    """The patterns of the cycles."""
+    pattern = optics.pattern
+    return cycle.CyclePlan(
+        phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s
+    )
+
+
+def _reconstructor(
+    spec: process.AcquisitionSpec, optics: OpticsConfig, plan: cycle.CyclePlan
+) -> tuple[cycle.Reconstructor, cycle.CyclePlan, float]:
+    """What makes figures of the frames, the patterns it needs, and the interval between its figures.
+
+    The figures have their covariance if the uncertainty of the geometry is stated.
+    """
+    shape = spec.config.shape
     kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
     spread, _ = spread_file.spread_of(optics, kept if kept is not None and kept.exists() else None)
-    return live.LiveReconstructor(optics, spec.config.shape.bin_px, spread=spread)
+    cycles = live.LiveReconstructor(optics, shape.bin_px, spread=spread)
+    if shape.mode == "cycle":
+        return cycles, plan, shape.period_s
+    exposure_s = optical_bench.exposure_s(spec.config) if spec.truth is None else 0.0
+    tracker = LiveTracker(optics, cycles, shape.track_periods, shape.track_step_s, exposure_s)
+    return tracker, replace(plan, standing=lambda: tracker.pattern), 1 / shape.track_rate_hz
 
 
 def _twin_bench(
@@ -207,7 +224,12 @@ def _twin_bench(
 
 def _warm_up(config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
     coarse = small(config.optics)
-    warm_up(live.LiveReconstructor(coarse, config.shape.bin_px), coarse, plan, position, clock)
+    cycles = live.LiveReconstructor(coarse, config.shape.bin_px)
+    warm_up(cycles, coarse, plan, position, clock)
+    if config.shape.mode == "track":
+        tracker = LiveTracker(coarse, cycles, config.optics.pattern.periods, config.shape.track_step_s)
+        one = replace(plan, standing=lambda: tracker.pattern)
+        warm_up(tracker, coarse, one, position, clock)
 
 
 def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock, remote: process.Remote) -> None:

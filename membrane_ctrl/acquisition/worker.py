@@ -126,7 +126,7 @@ class LiveDrift:
 
     def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
         """Returns a notice when a new calibration becomes due, and when no longer."""
-        if self._monitors is None or estimate.verdict == "rejected":
+        if self._monitors is None or estimate.verdict == "rejected" or estimate.kind == "track":
             return None
         residual, ring = self._monitors
         residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))

@@ -210,6 +210,9 @@ class ShapeConfig(Section):
 
     enabled: bool = True
     """Measure the shape and trim the setpoint. Set it to false on a bench without a camera."""
+    mode: Literal["cycle", "track"] = "cycle"
+    """`cycle` takes the frames of a figure one pattern after the other; `track` lets crossed fringes stand still, so
+    that every frame is a figure. Set it to `track` for a figure at the camera's rate (docs/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
@@ -227,6 +230,15 @@ class ShapeConfig(Section):
     """Age up to which a shape is used. Raise it with `period_s`, to several periods."""
     disagreement_max_um: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """Largest jump between camera and laser that the trim follows. Raise it for noisier shapes."""
+    track_rate_hz: Annotated[float, Field(ge=0.1, le=200)] = 20.0
+    """Figures per second in `track`, if camera and machine give that many. Lower it to leave more of the machine to
+    others."""
+    track_periods: Annotated[int, Field(ge=2, le=1000)] = 32
+    """Periods of the crossed fringes over the pattern. Lower it for a camera with few pixels; raise it where the
+    screen's light wanders over short distances."""
+    track_step_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
+    """Interval between steps of the crossed fringes; five steps measure the light anew. Lower it for a screen whose
+    light wanders within a minute."""
 
 
 class EstimatorConfig(Section):

@@ -8,7 +8,6 @@ and needs one or two Gauss-Newton steps with the normal matrix of the full cycle
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.optics import film_law, geometry, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, live_errors
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
-from membrane_ctrl.model.shape_estimate import Quality, ShapeEstimate, judge
-
-Kind = Literal["full", "fringes"]
+from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
 
 # Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of half a period, so
 # that a field which passes half a period anywhere shows points in the band before it.
@@ -119,7 +116,7 @@ class LiveReconstructor:
         try:
             state = motion.establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
         except ValueError as error:
-            return _rejected("full", times, readings, str(error))
+            return rejected("full", times, readings, str(error))
         self._watch.begin(state)
         return self._follow("full", state, times, readings)
 
@@ -130,7 +127,7 @@ class LiveReconstructor:
         """
         times, readings = _per_frame(frames, time_s, displacement_um, 2 * self._slots.steps, "fringes")
         if self._tracked is None:
-            return _rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
+            return rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
         self._binner.clear()
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         return self._follow("fringes", self._tracked, times, readings)
@@ -177,7 +174,7 @@ class LiveReconstructor:
         saturated = self._binner.saturated.ravel()[state.index] > 0
         usable = ~saturated & (state.fresh[:, 4].min(axis=0) > phase.FRINGE_SHARE * modulation_adu)
         if reason := _lost(state.fresh[:, 3], usable):
-            return _rejected(kind, times, readings, reason, tracking_lost=True)
+            return rejected(kind, times, readings, reason, tracking_lost=True)
         fit = self._fit(state, usable, readings)
         cycle = live_errors.Cycle(self._tracer(readings), state, fit, self._sums(), readings)
         errors = self._watch.look(cycle)
@@ -290,7 +287,7 @@ def _finite_mean(values: FloatArray) -> float:
     return float(finite.mean()) if finite.size else float("nan")
 
 
-def _rejected(
+def rejected(
     kind: Kind, times: FloatArray, readings: FloatArray, reason: str, tracking_lost: bool = False
 ) -> ShapeEstimate:
     """A cycle without a figure."""

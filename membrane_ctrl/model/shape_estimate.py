@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.model.arrays import FloatArray
 
-Kind = Literal["full", "fringes"]
+Kind = Literal["full", "fringes", "track"]
 Verdict = Literal["ok", "degraded", "rejected"]
 TERMS = 36
 
@@ -27,7 +27,9 @@ class ShapeEstimate:
     """Figure of the mirror from one cycle."""
 
     time_s: float  # middle of the exposures on the run's clock
-    kind: Kind  # "full" (Gray codes taken) or "fringes" (fringe orders carried over from the last absolute phase)
+    # "full" (Gray codes taken), "fringes" (fringe orders carried over from the last absolute phase) or "track" (one
+    # frame of crossed fringes)
+    kind: Kind
     # (36,) Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height; piston makes it 0 at the vertex
     coeffs_um: FloatArray
     # amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl
@@ -37,7 +39,8 @@ class ShapeEstimate:
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
     sag_sigma_um: float  # its standard deviation from `covariance_um2`
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
-    slope_residual_urad: float  # RMS of measured minus fitted slopes
+    # RMS of measured minus fitted slopes; of "track" the slopes that would leave as much light as the fit does
+    slope_residual_urad: float
     valid_fraction: float  # share of the analysis area with a slope
     modulation_median_adu: float  # fringe quality
     saturated_fraction: float

@@ -163,10 +163,14 @@ def _shape(config: Config) -> rrb.Vertical:
             _plot("Last frame to result, ms", "/shape/latency"),
         ),
     ]  # fmt: skip
+    if config.shape.mode == "track":
+        fall = "Z4 (top) to Z36, change since hold began; a column a second, now on the right"
+        rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH)))
     if config.recording.thumbnails:
         names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
+        names = ["crossed"] if config.shape.mode == "track" else names
         rows.append(rrb.Horizontal(*(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)))
-    return rrb.Vertical(*rows, row_shares=[4, 3, 2, 3][: len(rows)], name="Shape")
+    return rrb.Vertical(*rows, row_shares=[4, 3, 2, 3, 3][: len(rows)], name="Shape")
 
 
 def _timing() -> rrb.Vertical:

@@ -1,6 +1,7 @@
 """Telemetry rows to Rerun: one block of columns per stream, lanes where a code changed."""
 
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,7 +9,7 @@ import rerun as rr
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
-from membrane_ctrl.model.arrays import AnyArray
+from membrane_ctrl.model.arrays import AnyArray, FloatArray
 from membrane_ctrl.model.events import EventLine, for_people, level, sentence
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
@@ -169,6 +170,12 @@ class TelemetryStreams:
 DIFFERENCE_INTERVAL_S = 60.0
 DIFFERENCE_EARLY_S, EARLY_S = 10.0, 300.0
 MAP_INTERVAL_S = 600.0
+# Of the figures of single frames the timeline has one a second; the table has all.
+FRAME_INTERVAL_S = 1.0
+# The water-fall: a column for each of these, 8 kB.
+WATERFALL_COLUMNS = 120
+WATERFALL_INTERVAL_S, WATERFALL_EARLY_S = 20.0, 2.0
+WATERFALL_LEAST_UM = 0.05
 # Colours span nearly all of a map: a few pixels at the edge must not hide the rest.
 _NEARLY_ALL = 0.99
 # Zernike terms removed from the maps of change (the mount tilts, the loop holds the bowl's depth), and the least span
@@ -197,6 +204,8 @@ class ShapeStreams:
         self._reference_from_s = -math.inf
         self._next_map_s = -math.inf
         self._next_difference_s = -math.inf
+        self._next_frame_s = self._next_fall_s = -math.inf
+        self._fall: deque[FloatArray] = deque(maxlen=WATERFALL_COLUMNS)
         self._scatter = shapes.Scatter()
         self._colours: dict[str, str] = {}
         self._verdict = ""
@@ -212,7 +221,13 @@ class ShapeStreams:
         self._reference_from_s = from_s
 
     def send(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Send one estimate at the middle of its exposures; if rejected, only quality and verdict."""
+        """Send one estimate at the middle of its exposures; if rejected, only quality and verdict.
+
+        Of single frames of one verdict, one a second is sent.
+        """
+        if estimate.kind == "track" and estimate.verdict == self._verdict and estimate.time_s < self._next_frame_s:
+            return
+        self._next_frame_s = estimate.time_s + FRAME_INTERVAL_S
         time_s = np.array([estimate.time_s])
         for stream, values in _quality(estimate).items():
             self._recording.scalars(stream.path, time_s, np.array([values]))
@@ -228,8 +243,22 @@ class ShapeStreams:
         self._recording.scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
         for stream, (values, variances) in _changes(estimate, self.reference).items():
             self._recording.measurements(stream.path, time_s, np.array([values]), np.array([variances]))
+        if estimate.kind == "track":
+            self._fall.append((estimate.coeffs_um - self.reference.coeffs_um)[shapes.WATERFALL_TERMS])
         if self.pictures:
             self._send_maps(estimate, self.reference)
+            self._send_fall(estimate.time_s, estimate.time_s - self.reference.time_s < EARLY_S)
+
+    def _send_fall(self, time_s: float, early: bool) -> None:
+        """Send the terms of the last two minutes as a picture: a row for each, the newest on the right."""
+        if not self._fall or time_s < self._next_fall_s:
+            return
+        self._next_fall_s = time_s + (WATERFALL_EARLY_S if early else WATERFALL_INTERVAL_S)
+        terms = np.zeros((self._fall[0].size, WATERFALL_COLUMNS), np.float16)
+        terms[:, -len(self._fall) :] = np.array(self._fall).T
+        most_um = max(WATERFALL_LEAST_UM, float(np.abs(terms).max()))
+        self._recording.log(shapes.WATERFALL_PATH, time_s, map_picture(terms, (-most_um, most_um)))
+        self._colours["waterfall"] = f"±{most_um:.3g} µm"
 
     def _send_maps(self, estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> None:
         time_s = estimate.time_s
@@ -263,7 +292,8 @@ def _legend(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate, colours: dict[str, str]
 ) -> str:
     """Markdown: the ranges of the maps' colours, and one line per cycle."""
-    rows = "\n".join(f"| {name} | {colours[kind]} |" for kind, name in shapes.MAPS.items() if kind in colours)
+    names = {**shapes.MAPS, "waterfall": "terms over time"}
+    rows = "\n".join(f"| {name} | {colours[kind]} |" for kind, name in names.items() if kind in colours)
     reason = f" ({estimate.reason})" if estimate.reason else ""
     shared_um = estimate.geometry_sag_sigma_um
     shared = f", ± {shared_um:.3g} µm shared by all cycles" if math.isfinite(shared_um) else ""

@@ -80,7 +80,7 @@ def _words(values: NDArray[Any], of_sum: NDArray[Any] | None) -> tuple[bytes, ND
     if of_sum is not None:
         return OF_SUM, bits ^ of_sum.view(bits.dtype).reshape(bits.shape)
     code, whole = BITS, bits
-    if values.dtype == "<f8" and values.shape[1] == 1 and np.isfinite(values).all():
+    if values.dtype == "<f8" and np.isfinite(values).all():
         largest = float(np.abs(values).max())
         for digits in range(_DIGITS_MAX + 1):
             if largest * 10.0**digits >= _WHOLE_MAX:

@@ -176,6 +176,8 @@ def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
 
 
 BARS_PATH = "/shape/change_bars"
+WATERFALL_PATH = "/shape/waterfall"
+WATERFALL_TERMS = slice(3, None)  # Z4 to Z36: tilts are hundreds of times larger
 # The maps below `/shape/map/`, and their names for people.
 MAPS = {
     "height": "height",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from acquisition_fakes import (
 )
 from acquisition_fakes import VirtualClock as Clock
 
+from firmware_iface.roles import Pattern
 from membrane_ctrl.acquisition.cycle import (
     REJECTED_IN_A_ROW,
     CycleDone,
@@ -191,3 +193,17 @@ def test_stopped_cycle_has_no_result_and_is_taken_again(bench: Bench) -> None:
 def test_pauses_double_up_to_a_minute() -> None:
     assert [pause_s(n) for n in (-1, 0, 1, 2, 3)] == [0, 0, 1, 2, 4]
     assert pause_s(10**6) == 60.0
+
+
+def test_a_standing_pattern_is_shown_once_and_again_after_a_failure(bench: Bench) -> None:
+    steps = [Pattern("crossed", "", 32, 0.1 * k) for k in (0, 0, 0, 1)]
+    bench.cycle._plan = replace(PLAN, standing=lambda: steps.pop(0))
+    kinds = [bench.done().estimate.kind for _ in range(3)]
+    assert kinds == ["full", "fringes", "fringes"]
+    assert bench.screen.shown[len(FULL) :] == ["crossed"]
+    bench.camera.broken = True
+    bench.failed()
+    bench.camera.broken = False
+    bench.done()
+    assert bench.screen.shown[len(FULL) :] == ["crossed", "crossed"]
+    assert [len(call.levels) for call in bench.reconstructor.calls] == [18, 1, 1, 1]

@@ -37,6 +37,14 @@ def test_sinusoids_have_the_stated_phase() -> None:
             assert light == pytest.approx(0.5 + 0.5 * math.cos(phi + k * math.pi / 2), abs=1e-6)
 
 
+def test_crossed_fringes_share_the_light_of_both_axes() -> None:
+    light = pattern_light(Pattern("crossed", "", 7, 0.3, shift_y_rad=1.1), RASTER)
+    phi_x = 2 * math.pi * ((180 - 170) * 0.25 + 28) / 8 - math.pi
+    phi_y = 2 * math.pi * ((128 - 100) * 0.25 + 28) / 8 - math.pi
+    assert light[100, 180] == pytest.approx(0.5 + 0.25 * (math.cos(phi_x + 0.3) + math.cos(phi_y + 1.1)), abs=1e-6)
+    assert not light[pattern_light(Pattern("white"), RASTER) == 0].any()
+
+
 def test_gray_codes_number_the_half_periods() -> None:
     bits = [pattern_light(Pattern("gray", "x", bit), RASTER)[128] for bit in range(1, 5)]
     code = sum(bit.astype(int) << (3 - k) for k, bit in enumerate(bits))

@@ -46,3 +46,23 @@ def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path
     assert span("height")[0] == span("uncertainty")[0] == 0.0
     legend = strings(path, "/shape/legend", "TextDocument:text")[-1][1]
     assert f"| change | ±{high:.3g} µm |" in legend
+
+
+def test_of_twenty_frames_a_second_the_timeline_has_one_and_every_change_of_verdict(tmp_path: Path) -> None:
+    recording = Recording(tmp_path, "test", RunClock.start(), Config())
+    recording.next_segment()
+    streams = ShapeStreams(recording)
+    first = shape_of(0.0, 0)
+    for k in range(200):
+        lost = 105 <= k < 110
+        coeffs_um = first.coeffs_um + 0.3 * (np.arange(36) == 11) * (k >= 100)
+        verdict = "rejected" if lost else "ok"
+        streams.send(replace(first, time_s=k / 20, kind="track", coeffs_um=coeffs_um, verdict=verdict))
+    recording.close()
+    path = tmp_path / "test-000.rrd"
+    times = scalars(path, "/shape/residual", "Scalars:scalars")[0]
+    assert 11 <= len(times) <= 14
+    assert [state for _, state in strings(path, "/state/verdict", "StateChange:state")] == ["ok", "rejected", "ok"]
+    span = scalars(path, "/shape/waterfall", "DepthImage:depth_range")[1]
+    assert span[0, 0].tolist() == pytest.approx([-0.05, 0.05])
+    assert span[-1, 0].tolist() == pytest.approx([-0.3, 0.3], rel=1e-3)

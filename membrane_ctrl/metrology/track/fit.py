@@ -93,11 +93,13 @@ class FrameFitter:
     ----------
     scene : CrossedScene
         What a frame must show.
+    jacobian : (2, 36, n) array, optional
+        Of another scene with the same bins and surface; made anew if not given.
     """
 
-    def __init__(self, scene: CrossedScene) -> None:
+    def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
         self.scene = scene
-        self.jacobian = scene.jacobian(scene.surface)
+        self.jacobian = scene.jacobian(scene.surface) if jacobian is None else jacobian
         self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))

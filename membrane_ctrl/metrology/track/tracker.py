@@ -1,7 +1,7 @@
 """Follows the figure from frame to frame, and says which frames must not be used and why.
 
 A frame is fitted from the last good solution. A period lost everywhere at once leaves no residual, but it is no tilt
-either: rays meet the screen at other distances, so that some micrometres of astigmatism and coma appear (`_Orders`).
+either: rays meet the screen at other distances, so that some micrometres of astigmatism and coma appear (`LostOrders`).
 """
 
 import math
@@ -12,15 +12,12 @@ import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
-from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, squares, stepped
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
+from membrane_ctrl.metrology.track.guards import FrameFault, LostOrders, Squares, light_faults
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 
-# Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
-_COVERED = 0.25
-_COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
-_DARK = 0.3  # of the reference's light
 _CONTRAST = 0.4  # of the fringes, against the reference's
 _EXPOSURE = 0.03  # change of light from frame to frame that no panel makes
 _DIMMED = 0.9  # of the light at the anchor
@@ -33,6 +30,8 @@ _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
+_STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
+_STANDING_FRAMES = 20  # of each step, over which a held mirror's motion averages out
 _SIGMA_EVERY = 25  # frames: errors change slowly, and the covariance costs as much as five fits
 
 
@@ -42,21 +41,54 @@ class TrackedFrame:
 
     time_s: float  # middle of the exposure
     coeffs_um: FloatArray  # (36,) Noll j = 1..36, the vertex at 0
-    sigma_um: FloatArray  # (36,): 1 sigma against the reference's figure
+    covariance_um2: FloatArray  # (36, 36): of the error against the reference's figure
     hencky_um: float
     sag_um: float
     sag_sigma_um: float
     verdict: shape_estimate.Verdict
     reason: str
     rest_share: float  # what the fit leaves, over the swing of the fringes
+    used_share: float = 0.0  # of the bins, those with weight
+    swing_adu: float = math.nan  # of the fringes, median
+    saturated_share: float = 0.0  # of the bins
+    lost: bool = False  # the mirror may not be where the last good frame left it: a new reference is needed
+
+    @property
+    def sigma_um(self) -> FloatArray:
+        """(36,): 1 sigma against the reference's figure."""
+        return np.sqrt(np.diag(self.covariance_um2))
 
 
-@dataclass(frozen=True)
-class _Fault:
-    """Why a frame is not what it should be."""
+class _Standing:
+    """Means of the frames of one step of the pattern, while the mirror stays about where it is."""
 
-    verdict: shape_estimate.Verdict
-    reason: str
+    def __init__(self, shifts_rad: tuple[float, float]) -> None:
+        self.shifts_rad = shifts_rad
+        self.count = 0
+        self._parameters: list[FloatArray] = []  # of the first frame, then of all
+
+    def add(self, seen_adu: Singles, fit: FrameFit) -> None:
+        """Take a frame; the means begin anew where the mirror has left the first one's place."""
+        parameters = fit.surface.parameters
+        if self.count and np.max(np.abs(surface.height_probe() @ (parameters - self._parameters[0]))) > _STANDING_MM:
+            self.count = 0
+        if not self.count:
+            self._seen, self._light = np.zeros(seen_adu.size), np.zeros_like(fit.light)
+            self._parameters = [parameters]
+        self.count += 1
+        self._seen += seen_adu
+        self._light += fit.light
+        self._parameters.append(parameters)
+
+    def seen_adu(self) -> Singles:
+        """Means over the bins (n,)."""
+        return (self._seen / self.count).astype(np.float32)
+
+    def fit(self, radius_mm: float) -> FrameFit:
+        """The mean solution, without residual."""
+        shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
+        none = np.zeros(0, np.float32)
+        return FrameFit(shape, self._light / self.count, none, none, True)
 
 
 class Tracker:
@@ -87,23 +119,25 @@ class Tracker:
         self._binner = Binner(*size_px, scene.bin_px, full_scale_adu, 1)
         self._blind = noise_adu < _BLIND_NOISE_ADU
         self._noise_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
+        self._fitter = FrameFitter(scene)
         self._begin(scene, scene.surface)
-        self._last_displacement_um = displacement_um
-        self._orders = _Orders(self._fitter)
+        self._last_time_s, self._last_displacement_um = math.nan, displacement_um
+        self._anchor_light = math.nan
+        self._orders = LostOrders(self._fitter)
         self._knocked = ""
+        self._covariance_um2, self._covariance_age = np.full((36, 36), math.nan), 0
+        self._sag_sigma_um = math.nan
+        self._left, self._count = np.zeros(scene.index.size), 0
 
     def _begin(self, scene: CrossedScene, shape: surface.Surface) -> None:
         """Start from a scene and a surface, with the light of the scene."""
         none = np.zeros(scene.index.size, np.float32)
-        self._fitter = FrameFitter(scene)
+        self._fitter = FrameFitter(scene, self._fitter.jacobian)
         self._last = FrameFit(shape, np.zeros((3, 36)), none, none, True)
-        self._last_time_s, self._last_displacement_um = math.nan, math.nan
-        self._scale_adu = 0.0
-        self._light = self._anchor_light = math.nan
+        self._scale_adu, self._light = 0.0, math.nan
         self._seen: Singles = none
-        self._covariance, self._covariance_age = np.full((36, 36), math.nan), 0
-        self._squares = _Squares(scene)
-        self._left, self._count = np.zeros(scene.index.size), 0
+        self._squares = Squares(scene)
+        self._steps: list[_Standing] = []
 
     def anchor(
         self, frames: Sequence[Image], shifts_rad: FloatArray, time_s: FloatArray, displacement_um: FloatArray
@@ -131,12 +165,44 @@ class Tracker:
             seen.append(self._seen)
         if any(frame.verdict == "rejected" for frame in found):
             return found
-        scene, moved = stepped(self._fitter, fits, np.stack(seen), shifts_rad)
-        known = self._last_time_s, self._last_displacement_um
-        parameters = np.mean([fit.surface.parameters for fit in fits], axis=0) + moved
+        moved = self._renew(fits, np.stack(seen), shifts_rad)
+        return [_moved(frame, moved, self._last.surface.radius_mm) for frame in found]
+
+    def _renew(self, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray) -> FloatArray:
+        """Light, swings and phases of each bin from steps; returns by how much the parameters (36,) move."""
+        old = self._fitter.scene
+        scene, moved = stepped(self._fitter, fits, seen_adu, shifts_rad)
+        self._anchor_light /= float(np.median(scene.light_adu[0] / old.light_adu[0]))  # light counts from the scene's
+        parameters = self._last.surface.parameters + moved
         self._begin(scene, surface.Surface.from_parameters(parameters, scene.surface.radius_mm))
-        self._last_time_s, self._last_displacement_um = known
-        return [_moved(frame, moved, scene.surface.radius_mm) for frame in found]
+        return moved
+
+    def _remember(self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit) -> None:
+        """Add a good frame to its step."""
+        if not self._steps or self._steps[-1].shifts_rad != shifts_rad:
+            self._steps = [*self._steps[1 - ENOUGH_STEPS :], _Standing(shifts_rad)]
+        self._steps[-1].add(seen_adu, fit)
+
+    def _take_steps(self, shifts_rad: tuple[float, float]) -> None:
+        """Renew the scene if the frames before this one were the last of five steps that separate the axes.
+
+        Five steps determine the five unknowns of a bin, whatever motion is assumed between them. What the fits of the
+        steps say of it is true as far as the light is known; over many frames a held mirror is still.
+        """
+        steps = self._steps
+        if len(steps) < ENOUGH_STEPS or steps[-1].shifts_rad == shifts_rad:
+            return
+        shown = np.array([step.shifts_rad for step in steps])
+        fits = [step.fit(self._last.surface.radius_mm) for step in steps]
+        if min(step.count for step in steps) >= _STANDING_FRAMES:
+            parameters = np.array([fit.surface.parameters for fit in fits])
+            mean_mm = parameters.mean(axis=0)
+            if np.max(np.abs(surface.height_probe() @ (parameters - mean_mm).T)) > _STANDING_MM:
+                return
+            mean = surface.Surface.from_parameters(mean_mm, self._last.surface.radius_mm)
+            fits = [replace(fit, surface=mean) for fit in fits]
+        if separable(shown):
+            self._renew(fits, np.stack([step.seen_adu() for step in steps]), shown)
 
     def follow(
         self, frame: Image, shifts_rad: tuple[float, float], time_s: float, displacement_um: float = math.nan
@@ -156,6 +222,7 @@ class Tracker:
 
         Raises ValueError for a frame of wrong size or type.
         """
+        self._take_steps(shifts_rad)
         self._binner.clear()
         self._binner.add([frame], [0])
         index = self._fitter.scene.index
@@ -165,7 +232,7 @@ class Tracker:
             return _rejected(time_s, "frozen: the frame is identical to the one before")
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
-        faults = [*_light_faults(float(np.mean(saturated)), light, covered), *self._light_changes(light)]
+        faults = [*light_faults(float(np.mean(saturated)), light, covered), *self._light_changes(light)]
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
             return _rejected(time_s, rejected.reason)
@@ -174,10 +241,13 @@ class Tracker:
         out = float(np.mean(fit.weights[~saturated & ~self._squares.bins(covered)] == 0))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
         if doubt is not None and doubt.verdict == "rejected":
-            return _rejected(time_s, doubt.reason, rest)
+            return _rejected(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, time_s, displacement_um)
-        worst = doubt or next(iter(faults), None) or _Fault("ok", "")
-        return self._result(fit, shifts_rad, time_s, worst, rest)
+        worst = doubt or next(iter(faults), None) or FrameFault("ok", "")
+        if worst.verdict == "ok":
+            self._remember(shifts_rad, seen, fit)
+        found = self._result(fit, shifts_rad, time_s, worst, rest)
+        return replace(found, saturated_share=float(np.mean(saturated)))
 
     def missed(self, time_s: float, reason: str) -> TrackedFrame:
         """The result of a frame that could not be read."""
@@ -189,15 +259,17 @@ class Tracker:
         out.ravel()[self._fitter.scene.index] = self._left / max(self._count, 1)
         return out
 
-    def _light_changes(self, light: float) -> list[_Fault]:
+    def _light_changes(self, light: float) -> list[FrameFault]:
         """What the light says of exposure and panel."""
         faults = []
         if abs(light / self._light - 1) > _EXPOSURE:
             faults.append(
-                _Fault("degraded", f"exposure changed: {light / self._light:.2f} of the light of the last frame")
+                FrameFault("degraded", f"exposure changed: {light / self._light:.2f} of the light of the last frame")
             )
         elif light < _DIMMED * self._anchor_light:
-            faults.append(_Fault("degraded", f"the screen dimmed to {light / self._anchor_light:.0%} of its light"))
+            faults.append(
+                FrameFault("degraded", f"the screen dimmed to {light / self._anchor_light:.0%} of its light")
+            )
         return faults
 
     def _fitted(
@@ -246,35 +318,40 @@ class Tracker:
         swing = float(np.median(self._fitter.scene.light_adu[1]))
         return not fit.converged or self._scale_of(fit) > _REST_REJECTED * swing
 
-    def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> _Fault | None:
+    def _doubt(
+        self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float
+    ) -> FrameFault | None:
         """Whether the solution is the next one of this mirror."""
         if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
-            return _Fault("rejected", f"order lost: the mirror moved too far since the last good frame ({left})")
+            return FrameFault(
+                "rejected", f"order lost: the mirror moved too far since the last good frame ({left})", True
+            )
         contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
         if contrast < -_CONTRAST:
-            return _Fault("rejected", "order lost: the fringes moved by half a period")
+            return FrameFault("rejected", "order lost: the fringes moved by half a period", True)
         if contrast < _CONTRAST:
-            return _Fault("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
+            return FrameFault("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
         if not self._orders.sure(change_um, passed_s):
-            return _Fault(
+            return FrameFault(
                 "rejected",
                 "order lost: the mirror moved by a period or more since the last good frame, or changed its shape "
                 f"(tilt {np.hypot(*change_um[:2]):.0f} um RMS, other terms {self._orders.odd_um(change_um):.1f})",
+                lost=True,
             )
         sag_um = float(surface.sag_gradient() @ change_um)
         if abs(sag_um - (displacement_um - self._last_displacement_um)) > _LASER_UM:
-            return _Fault("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see")
+            return FrameFault("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
         tilt_um = float(np.hypot(*change_um[:2]))
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
             self._knocked = (
                 f"knocked: the figure tilted by {urad:.0f} urad at {time_s:.2f} s; check camera and screen"
             )
-        return _Fault("degraded", self._knocked) if self._knocked else None
+        return FrameFault("degraded", self._knocked, True) if self._knocked else None
 
     def _accept(self, fit: FrameFit, light: float, time_s: float, displacement_um: float) -> None:
         self._last, self._light = fit, light
@@ -285,46 +362,36 @@ class Tracker:
             self._anchor_light = light
 
     def _result(
-        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: _Fault, rest: float
+        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: FrameFault, rest: float
     ) -> TrackedFrame:
         if self._covariance_age % _SIGMA_EVERY == 0:
-            found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu)
-            known = np.isfinite(self._covariance).all()
-            self._covariance = 0.7 * self._covariance + 0.3 * found if known else found
+            self._estimate_errors(fit, shifts_rad)
         self._covariance_age += 1
-        to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
             time_s=time_s,
             coeffs_um=1e3 * fit.surface.coeffs_mm,
-            sigma_um=1e3 * np.sqrt(np.diag(to_coeffs @ self._covariance @ to_coeffs.T)),
+            covariance_um2=self._covariance_um2,
             hencky_um=1e3 * fit.surface.hencky_mm,
             sag_um=1e3 * fit.surface.sag_mm,
-            sag_sigma_um=1e3 * math.sqrt(gradient @ self._covariance @ gradient),
+            sag_sigma_um=self._sag_sigma_um,
             verdict=fault.verdict,
             reason=fault.reason,
             rest_share=rest,
+            used_share=float(np.mean(fit.weights > 0)),
+            swing_adu=float(np.median(self._fitter.scene.light_adu[1])) * (1 + float(fit.light[1, 0])),
+            lost=fault.lost,
         )
 
-
-def _light_faults(saturated: float, light: float, covered: BoolArray) -> list[_Fault]:
-    """What the picture's light says before any fit."""
-    share = float(np.mean(covered))
-    checks = (
-        (
-            saturated > shape_estimate.SATURATED_REJECTED_FRACTION,
-            "rejected",
-            f"saturated: {saturated:.0%} of the bins",
-        ),
-        (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
-        (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
-        (
-            saturated > shape_estimate.SATURATED_DEGRADED_FRACTION,
-            "degraded",
-            f"saturated: {saturated:.1%} of the bins",
-        ),
-        (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
-    )
-    return [_Fault(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
+    def _estimate_errors(self, fit: FrameFit, shifts_rad: tuple[float, float]) -> None:
+        """Covariance of the coefficients and sigma of the sag, smoothed over the estimates."""
+        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu)
+        to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
+        covariance = 1e6 * to_coeffs @ found @ to_coeffs.T
+        sag_sigma_um = 1e3 * math.sqrt(gradient @ found @ gradient)
+        if np.isfinite(self._covariance_um2).all():
+            covariance = 0.7 * self._covariance_um2 + 0.3 * covariance
+            sag_sigma_um = math.sqrt(0.7 * self._sag_sigma_um**2 + 0.3 * sag_sigma_um**2)
+        self._covariance_um2, self._sag_sigma_um = covariance, sag_sigma_um
 
 
 def _moved(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
@@ -338,58 +405,9 @@ def _moved(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedF
     )
 
 
-def _rejected(time_s: float, reason: str, rest: float = math.nan) -> TrackedFrame:
-    none = np.full(36, math.nan)
-    return TrackedFrame(time_s, none, none, math.nan, math.nan, math.nan, "rejected", reason, rest)
+_NONE, _NO_COVARIANCE = np.full(36, math.nan), np.full((36, 36), math.nan)
 
 
-class _Squares:
-    """The mirror in squares, each larger than a fringe, for the light of a frame."""
-
-    def __init__(self, scene: CrossedScene) -> None:
-        self._number = squares(scene.position_mm, scene.surface.radius_mm, 12)
-        self._count = np.bincount(self._number)
-        self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
-        self._level = self._means(scene.light_adu[0])
-
-    def _means(self, values: FloatArray | Singles) -> FloatArray:
-        return np.asarray(np.bincount(self._number, values) / self._count)
-
-    def look(self, seen: Singles) -> tuple[float, BoolArray]:
-        """Light of a frame over the scene's, and the squares whose light is wrong."""
-        share = self._means(seen) / self._level
-        light = float(np.median(share[self._whole]))
-        return light, self._whole & (np.abs(share - light) > _COVERED * max(light, 1e-6))
-
-    def bins(self, chosen: BoolArray) -> BoolArray:
-        """The bins (n,) of squares."""
-        return np.asarray(chosen[self._number])
-
-
-class _Orders:
-    """What a change of shape would be if whole periods were lost."""
-
-    def __init__(self, fitter: FrameFitter) -> None:
-        bowl = surface.Surface.hencky_bowl(1.0, fitter.scene.surface.radius_mm).parameters
-        self._bowl = bowl / np.linalg.norm(bowl)
-        x, y = fitter.period_um()
-        pairs = [(m, n) for m in range(-8, 9) for n in range(-8, 9) if m or n]
-        self._lost_um = np.array([m * x + n * y for m, n in pairs])
-
-    def odd_um(self, change_um: FloatArray) -> FloatArray:
-        """RMS of a change (..., 36) without its tilt and without its bowl."""
-        rest = np.array(change_um)
-        rest[..., :2] = 0.0
-        rest -= (rest @ self._bowl)[..., None] * self._bowl
-        return np.asarray(np.linalg.norm(rest, axis=-1))
-
-    def sure(self, change_um: FloatArray, passed_s: float) -> bool:
-        """Whether a change is that of a film, and would not be with any orders lost."""
-        usual_um = min(0.5 + 0.05 * passed_s, 1.0)
-
-        def strange(change: FloatArray) -> FloatArray:
-            tilt_um = np.hypot(change[..., 0], change[..., 1])
-            return np.asarray((self.odd_um(change) / usual_um) ** 2 + (tilt_um / 150.0) ** 2)
-
-        own = float(strange(change_um))
-        return own < 16.0 and bool(np.all(strange(change_um + self._lost_um) > own + 16.0))
+def _rejected(time_s: float, reason: str, rest: float = math.nan, lost: bool = False) -> TrackedFrame:
+    nan = math.nan
+    return TrackedFrame(time_s, _NONE, _NO_COVARIANCE, nan, nan, nan, "rejected", reason, rest, lost=lost)

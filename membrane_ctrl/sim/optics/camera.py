@@ -2,7 +2,9 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -85,7 +87,7 @@ class OpticsRenderer:
         full = float(2**camera.bits - 1)
         dark = self.light.dark_fraction * full
         self._pictures += 1
-        shade(
+        fixed = (
             self._nodes(displacement_um),
             self._weights,
             2 if pattern.role == "crossed" else int(pattern.axis == "y"),
@@ -99,6 +101,10 @@ class OpticsRenderer:
             (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
             picture,
         )
+        middle = camera.height_px // 2
+        other = _second_hand().submit(shade, *fixed, middle, camera.height_px)
+        shade(*fixed, 0, middle)
+        other.result()
         return picture
 
     def trace_pixels(self, displacement_um: float) -> Trace:
@@ -134,6 +140,12 @@ class OpticsRenderer:
         while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
             self._traces.popitem(last=False)
         return self._traces[displacement_um]
+
+
+@cache
+def _second_hand() -> ThreadPoolExecutor:
+    """A thread that shades half of each picture."""
+    return ThreadPoolExecutor(1, "shade")
 
 
 def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:

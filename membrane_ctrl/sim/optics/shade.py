@@ -86,7 +86,7 @@ def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray, line: Flo
         )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def shade(
     # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2)
     nodes: FloatArray,
@@ -101,10 +101,12 @@ def shade(
     loss: tuple[FloatArray, FloatArray],  # vignetting (W,), (H,): a column's part and a row's
     noise: tuple[Singles, float, int],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
     out: Pixels,
+    start: int,
+    stop: int,
 ) -> None:
-    """Fill `out` (H, W) with the picture of one pattern."""
+    """Fill rows start to stop of `out` (H, W) with the picture of one pattern."""
     step = weights.shape[0]
-    height, width = out.shape
+    width = out.shape[1]
     values, cell_mm, smooth = table
     dark, white, leak, full, gamma = scale
     column_loss, row_loss = loss
@@ -112,8 +114,10 @@ def shade(
     radius2_mm2 = radius_mm * radius_mm
     # three arrays, not rows of one: a view taken per pixel costs more than the pixel
     line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
-    state, bits = np.uint64(seed) * _MIX_1, np.uint64(0)
-    for row in range(height):
+    bits = np.uint64(0)
+    for row in range(start, stop):
+        # as if all rows before it had been shaded by the same hand
+        state = np.uint64(seed) * _MIX_1 + np.uint64(row) * np.uint64((width + 3) // 4) * _GOLDEN
         _row_of_nodes(nodes, 0, row // step, weights[row % step], line_x)
         _row_of_nodes(nodes, 1, row // step, weights[row % step], line_y)
         _row_of_nodes(nodes, 2, row // step, weights[row % step], line_r2)
@@ -129,7 +133,9 @@ def shade(
                         light = _level(s_y_mm if axis == 1 else s_x_mm, values, 0, cell_mm, smooth)
                         if axis == 2:
                             light = max(0.0, light + _level(s_y_mm, values, 1, cell_mm, smooth))
-                            light = leak + (1.0 - leak) * light**gamma
+                            if gamma != 1.0:  # a power costs as much as the rest of the pixel
+                                light = light**gamma
+                            light = leak + (1.0 - leak) * light
                     counts += white * light * (1.0 - column_loss[column] - row_loss[row])
                 if sigma > 0.0:
                     if column & 3 == 0:  # four 16-bit numbers from each 64-bit one

@@ -1,0 +1,98 @@
+"""What the light of a frame says before any fit, and whether a change of shape can be a film's."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.optics import surface
+from membrane_ctrl.metrology.track.fit import FrameFitter, squares
+from membrane_ctrl.metrology.track.scene import CrossedScene
+from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, Singles
+
+# Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
+_COVERED = 0.25
+_COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
+_DARK = 0.3  # of the reference's light
+
+
+@dataclass(frozen=True)
+class FrameFault:
+    """Why a frame is not what it should be."""
+
+    verdict: shape_estimate.Verdict
+    reason: str
+    lost: bool = False
+
+
+def light_faults(saturated: float, light: float, covered: BoolArray) -> list[FrameFault]:
+    """What the picture's light says before any fit."""
+    share = float(np.mean(covered))
+    checks = (
+        (
+            saturated > shape_estimate.SATURATED_REJECTED_FRACTION,
+            "rejected",
+            f"saturated: {saturated:.0%} of the bins",
+        ),
+        (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
+        (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
+        (
+            saturated > shape_estimate.SATURATED_DEGRADED_FRACTION,
+            "degraded",
+            f"saturated: {saturated:.1%} of the bins",
+        ),
+        (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
+    )
+    return [FrameFault(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
+
+
+class Squares:
+    """The mirror in squares, each larger than a fringe, for the light of a frame."""
+
+    def __init__(self, scene: CrossedScene) -> None:
+        self._number = squares(scene.position_mm, scene.surface.radius_mm, 12)
+        self._count = np.bincount(self._number)
+        self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
+        self._level = self._means(scene.light_adu[0])
+
+    def _means(self, values: FloatArray | Singles) -> FloatArray:
+        return np.asarray(np.bincount(self._number, values) / self._count)
+
+    def look(self, seen: Singles) -> tuple[float, BoolArray]:
+        """Light of a frame over the scene's, and the squares whose light is wrong."""
+        share = self._means(seen) / self._level
+        light = float(np.median(share[self._whole]))
+        return light, self._whole & (np.abs(share - light) > _COVERED * max(light, 1e-6))
+
+    def bins(self, chosen: BoolArray) -> BoolArray:
+        """The bins (n,) of squares."""
+        return np.asarray(chosen[self._number])
+
+
+class LostOrders:
+    """What a change of shape would be if whole periods were lost."""
+
+    def __init__(self, fitter: FrameFitter) -> None:
+        bowl = surface.Surface.hencky_bowl(1.0, fitter.scene.surface.radius_mm).parameters
+        self._bowl = bowl / np.linalg.norm(bowl)
+        x, y = fitter.period_um()
+        pairs = [(m, n) for m in range(-8, 9) for n in range(-8, 9) if m or n]
+        self._lost_um = np.array([m * x + n * y for m, n in pairs])
+
+    def odd_um(self, change_um: FloatArray) -> FloatArray:
+        """RMS of a change (..., 36) without its tilt and without its bowl."""
+        rest = np.array(change_um)
+        rest[..., :2] = 0.0
+        rest -= (rest @ self._bowl)[..., None] * self._bowl
+        return np.asarray(np.linalg.norm(rest, axis=-1))
+
+    def sure(self, change_um: FloatArray, passed_s: float) -> bool:
+        """Whether a change is that of a film, and would not be with any orders lost."""
+        usual_um = min(0.5 + 0.05 * passed_s, 1.0)
+
+        def strange(change: FloatArray) -> FloatArray:
+            tilt_um = np.hypot(change[..., 0], change[..., 1])
+            return np.asarray((self.odd_um(change) / usual_um) ** 2 + (tilt_um / 150.0) ** 2)
+
+        own = float(strange(change_um))
+        return own < 16.0 and bool(np.all(strange(change_um + self._lost_um) > own + 16.0))

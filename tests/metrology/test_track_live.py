@@ -1,0 +1,151 @@
+"""Tracking in a hold: the anchor, the steps of the pattern, and what follows when the mirror is lost."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.metrology import phase
+from membrane_ctrl.metrology.live import LiveReconstructor
+from membrane_ctrl.metrology.track.live import LOST_S, REJECTED_S, LiveTracker
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import typical_film
+
+SHRINK = 8
+OPTICS = OpticsConfig(camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK))
+FILM = typical_film(37.1, 500.0, seed=1)
+RATE_HZ, STEP_S = 4.0, 1.0
+
+
+class Bench:
+    """A tracker, and the twin's frames for it at a rate; `stains` multiply the light of the crossed frames."""
+
+    def __init__(self) -> None:
+        self.tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), 32, STEP_S, exposure_s=0.02)
+        self.renderer = OpticsRenderer(OPTICS, FILM, seed=3)
+        self.time_s, self.rate_hz = 0.0, RATE_HZ
+        self.shown: list[Pattern] = []
+        self.stains: NDArray[np.float64] | float = 1.0
+
+    def full(self, moved_um: float = 0.0) -> ShapeEstimate:
+        frames = [self.renderer.render(p, moved_um) for p in phase.full_sequence(OPTICS.pattern)]
+        self.time_s += 2.0
+        return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
+
+    def frame(self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0) -> ShapeEstimate:
+        self.time_s += 1 / self.rate_hz
+        self.shown.append(self.tracker.pattern)
+        picture = self.renderer.render(self.tracker.pattern, moved_um, gain=gain)
+        picture = np.rint(picture * self.stains).clip(0, 255).astype(np.uint8)
+        return self.tracker.fringes([picture], np.array([self.time_s]), np.array([reading_um]))
+
+    def frames(self, count: int, moved_um: float = 0.0, **given: float) -> list[ShapeEstimate]:
+        return [self.frame(moved_um, **given) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def anchored() -> Bench:
+    bench = Bench()
+    assert bench.full().verdict == "ok"
+    return bench
+
+
+@pytest.fixture
+def bench(anchored: Bench) -> Bench:
+    """A bench that follows the mirror at rest."""
+    assert anchored.full().verdict == "ok"
+    anchored.stains, anchored.shown, anchored.rate_hz = 1.0, [], RATE_HZ
+    return anchored
+
+
+def test_every_frame_follows_the_film(bench: Bench) -> None:
+    truth_um = [0.5 * math.sin(k) for k in range(12)]
+    found = [bench.frame(um, um) for um in truth_um]
+    assert {(e.kind, e.verdict, e.tracking_lost) for e in found} == {("track", "ok", False)}, [
+        e.reason for e in found
+    ]
+    error_um = np.array([e.sag_um - 1e3 * FILM.sag_at_mm(um) for e, um in zip(found, truth_um, strict=True)])
+    assert np.std(error_um) < 2 * found[-1].sag_sigma_um
+    assert [e.displacement_um for e in found] == pytest.approx(truth_um, abs=6e-4)
+    assert found[0].time_s == pytest.approx(bench.time_s - 11 / RATE_HZ + 0.01)  # the middle of the exposure
+    assert unpack_estimate(pack_estimate(found[0])).coeffs_um.tolist() == found[0].coeffs_um.tolist()
+    counts = 1e3 * found[0].coeffs_um
+    assert np.allclose(counts, np.rint(counts), atol=1e-6)  # whole nanometres
+    assert 0.9 < found[-1].valid_fraction <= 1
+    assert found[-1].covariance_um2 is found[-2].covariance_um2  # the recorder stores a matrix once
+
+
+def test_the_pattern_steps_at_first_and_then_now_and_then(bench: Bench) -> None:
+    bench.frames(5 + round(2.6 * STEP_S * RATE_HZ))
+    first = bench.shown[:5]
+    assert len(set(first)) == 5
+    assert {(p.role, p.index) for p in bench.shown} == {("crossed", 32)}
+    changes = [k for k in range(6, len(bench.shown)) if bench.shown[k] != bench.shown[k - 1]]
+    assert np.diff([5, *changes]).tolist() == pytest.approx([STEP_S * RATE_HZ] * 2, abs=1)
+    turns = np.array([[p.shift_rad, p.shift_y_rad] for p in first]) * 5 / (2 * math.pi)
+    assert turns.tolist() == [[0, 0], [1, 2], [2, 4], [3, 1], [4, 3]]
+
+
+@pytest.mark.campaign
+def test_steps_take_out_what_no_smooth_map_can(bench: Bench) -> None:
+    """Stains of 65 mm came after the anchor: they bend the figure until five steps have passed."""
+    rows, columns = np.mgrid[: OPTICS.camera.height_px, : OPTICS.camera.width_px]
+    bench.frames(6)
+    still = np.mean([e.coeffs_um for e in bench.frames(20)], axis=0)
+    bench.stains = 1 + 0.04 * np.sin(rows / 2.4) * np.sin(columns / 2.6)
+    bench.rate_hz = 22.0 / STEP_S  # frames of a step that make a mean
+
+    def off_um(found: list[ShapeEstimate]) -> float:
+        return float(np.linalg.norm((np.mean([e.coeffs_um for e in found], axis=0) - still)[1:]))
+
+    before = off_um(bench.frames(20))
+    bench.frames(8 * 22)  # what is left of the step before the stains, and five with them
+    assert off_um(bench.frames(20)) < 0.5 * before
+
+
+def test_a_lost_order_is_said_and_found_again_by_a_full_cycle(bench: Bench) -> None:
+    bench.frames(6)
+    lost = bench.frames(round(LOST_S * RATE_HZ) + 1, 900.0)
+    assert {e.verdict for e in lost} == {"rejected"}
+    assert all(e.reason.startswith("order lost") for e in lost), lost[0].reason
+    assert lost[-1].tracking_lost
+    assert not any(e.tracking_lost for e in lost[:-2])
+    full = bench.full(900.0)
+    assert full.verdict == "ok"
+    again = bench.frame(900.0)
+    assert again.verdict == "ok"
+    assert again.sag_um == pytest.approx(full.sag_um, abs=0.2)
+
+
+def test_after_a_short_jump_the_frames_are_followed_again(bench: Bench) -> None:
+    bench.frames(6)
+    bench.frames(5, 900.0)
+    found = bench.frames(round(LOST_S * RATE_HZ) + 5)
+    assert {(e.verdict, e.tracking_lost) for e in found} == {("ok", False)}
+
+
+def test_the_dark_asks_for_a_full_cycle_only_after_a_while(bench: Bench) -> None:
+    assert {e.verdict for e in bench.frames(6)} == {"ok"}
+    dark = bench.frames(round(REJECTED_S * RATE_HZ) + 1, gain=0.05)
+    assert {e.reason.split(":")[0] for e in dark} == {"dark"}
+    assert dark[-1].tracking_lost
+    assert not any(e.tracking_lost for e in dark[:-2])
+
+
+def test_without_an_anchor_a_frame_is_rejected() -> None:
+    found = Bench().frame()
+    assert (found.kind, found.verdict, found.tracking_lost) == ("track", "rejected", True)
+
+
+def test_a_pattern_too_fine_for_the_camera_is_named() -> None:
+    bench = Bench()
+    bench.tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), 200, STEP_S)
+    found = bench.full()
+    assert (found.kind, found.verdict) == ("full", "rejected")
+    assert "pixels a fringe" in found.reason
