@@ -17,7 +17,7 @@ _DARK = 0.3  # of the reference's light
 
 
 @dataclass(frozen=True)
-class FrameFault:
+class Finding:
     """Why a frame is not what it should be."""
 
     verdict: shape_estimate.Verdict
@@ -25,7 +25,7 @@ class FrameFault:
     lost: bool = False
 
 
-def light_faults(saturated: float, light: float, covered: BoolArray) -> list[FrameFault]:
+def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Finding]:
     """What the picture's light says before any fit."""
     share = float(np.mean(covered))
     checks = (
@@ -43,7 +43,7 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fra
         ),
         (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
     )
-    return [FrameFault(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
+    return [Finding(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
 
 
 class Squares:

@@ -1,7 +1,7 @@
 """Follows the figure from frame to frame, and says which frames must not be used and why.
 
 A frame is fitted from the last good solution. A period lost everywhere at once leaves no residual, but it is no tilt
-either: rays meet the screen at other distances, so that some micrometres of astigmatism and coma appear (`LostOrders`).
+either: rays meet the screen at other distances, so that micrometres of astigmatism and coma appear (`LostOrders`).
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
-from membrane_ctrl.metrology.track.guards import FrameFault, LostOrders, Squares, light_faults
+from membrane_ctrl.metrology.track.guards import Finding, LostOrders, Squares, light_faults
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
@@ -243,7 +243,7 @@ class Tracker:
         if doubt is not None and doubt.verdict == "rejected":
             return _rejected(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, time_s, displacement_um)
-        worst = doubt or next(iter(faults), None) or FrameFault("ok", "")
+        worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
             self._remember(shifts_rad, seen, fit)
         found = self._result(fit, shifts_rad, time_s, worst, rest)
@@ -259,17 +259,15 @@ class Tracker:
         out.ravel()[self._fitter.scene.index] = self._left / max(self._count, 1)
         return out
 
-    def _light_changes(self, light: float) -> list[FrameFault]:
+    def _light_changes(self, light: float) -> list[Finding]:
         """What the light says of exposure and panel."""
         faults = []
         if abs(light / self._light - 1) > _EXPOSURE:
             faults.append(
-                FrameFault("degraded", f"exposure changed: {light / self._light:.2f} of the light of the last frame")
+                Finding("degraded", f"exposure changed: {light / self._light:.2f} of the light of the last frame")
             )
         elif light < _DIMMED * self._anchor_light:
-            faults.append(
-                FrameFault("degraded", f"the screen dimmed to {light / self._anchor_light:.0%} of its light")
-            )
+            faults.append(Finding("degraded", f"the screen dimmed to {light / self._anchor_light:.0%} of its light"))
         return faults
 
     def _fitted(
@@ -318,25 +316,23 @@ class Tracker:
         swing = float(np.median(self._fitter.scene.light_adu[1]))
         return not fit.converged or self._scale_of(fit) > _REST_REJECTED * swing
 
-    def _doubt(
-        self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float
-    ) -> FrameFault | None:
+    def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
         if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
             left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
-            return FrameFault(
+            return Finding(
                 "rejected", f"order lost: the mirror moved too far since the last good frame ({left})", True
             )
         contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
         if contrast < -_CONTRAST:
-            return FrameFault("rejected", "order lost: the fringes moved by half a period", True)
+            return Finding("rejected", "order lost: the fringes moved by half a period", True)
         if contrast < _CONTRAST:
-            return FrameFault("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
+            return Finding("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
         if not self._orders.sure(change_um, passed_s):
-            return FrameFault(
+            return Finding(
                 "rejected",
                 "order lost: the mirror moved by a period or more since the last good frame, or changed its shape "
                 f"(tilt {np.hypot(*change_um[:2]):.0f} um RMS, other terms {self._orders.odd_um(change_um):.1f})",
@@ -344,14 +340,14 @@ class Tracker:
             )
         sag_um = float(surface.sag_gradient() @ change_um)
         if abs(sag_um - (displacement_um - self._last_displacement_um)) > _LASER_UM:
-            return FrameFault("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
+            return Finding("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
         tilt_um = float(np.hypot(*change_um[:2]))
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
             self._knocked = (
                 f"knocked: the figure tilted by {urad:.0f} urad at {time_s:.2f} s; check camera and screen"
             )
-        return FrameFault("degraded", self._knocked, True) if self._knocked else None
+        return Finding("degraded", self._knocked, True) if self._knocked else None
 
     def _accept(self, fit: FrameFit, light: float, time_s: float, displacement_um: float) -> None:
         self._last, self._light = fit, light
@@ -362,7 +358,7 @@ class Tracker:
             self._anchor_light = light
 
     def _result(
-        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: FrameFault, rest: float
+        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: Finding, rest: float
     ) -> TrackedFrame:
         if self._covariance_age % _SIGMA_EVERY == 0:
             self._estimate_errors(fit, shifts_rad)
