@@ -1,0 +1,233 @@
+"""Vibrations of the mirror in its tracked terms: frequency, shape and amplitude of each.
+
+A term that oscillates at f gives, at the frames' own times t, the same numbers at f and at every alias of f. Frames
+taken at two rates have different aliases: only the true frequency explains both. So each piece of some seconds is
+projected on exp(-2 pi i f t) for frequencies far beyond half the frame rate,
+
+    X_p(f) = sum over frames of w z exp(-2 pi i f t),
+
+with a Hann window w. T(f) is the power of all X_p of one shape, in units of their noise: the largest eigenvalue over
+the shapes. Without a vibration it follows about a gamma distribution, whose scale and order its quantiles give. The
+largest T is a vibration if chance would give it once in ten thousand nights; it is subtracted from the terms, and the
+search goes on with what is left. T is also the logarithm of the likelihood (Bretthorst 1988, chapter 3), so that its
+curvature is the frequency's variance, and frequencies with a T nearly as large are named as equally possible.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+
+ComplexArray = NDArray[np.complex128]
+
+PIECE_S = 10.0  # a line of 48 Hz with a quality of 500 is as wide as the resolution of that, 0.1 Hz
+LEAST_S = 20.0
+_LEAST_HZ = 1.2  # slower than that is weather, leak and control
+_GRID = 4  # frequencies per resolution
+_TAKEN = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # resolutions about a line that go with it: it may be damped
+_SHORTEST = 0.6  # shorter frames of one rate, in pieces, are left out
+_GAP = 4.5  # intervals: as long a pause ends a piece
+_MOST = 24
+_CHANCE = 1e-9  # of a false line in one search
+_ALIKE = 10.0  # difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
+_MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
+_APART_HZ = 0.3  # closer ones are one line
+
+
+@dataclass(frozen=True)
+class VibrationMode:
+    """One vibration."""
+
+    frequency_hz: float
+    sigma_hz: float
+    amplitude_nm: float  # of the oscillation, RMS over the mirror
+    shape: FloatArray  # (36,): terms, unit RMS; the largest is positive
+    evidence: float  # T less that of noise
+    # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
+    aliases_hz: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some seconds of frames."""
+
+    time_s: FloatArray  # (n,)
+    window: FloatArray  # (n,)
+    waves: ComplexArray  # (frequencies, n)
+    alias_hz: FloatArray  # (frequencies,): their aliases below half its frame rate
+    blind: BoolArray  # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
+
+    def projected(self, terms_um: FloatArray) -> ComplexArray:
+        """X (frequencies, 36) of terms (n, 36)."""
+        return np.asarray(self.waves @ (self.window[:, None] * terms_um))
+
+    def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
+        """The terms without oscillations about a frequency that `shapes` (36, 36) projects on; others stay."""
+        times = 2 * np.pi * (self.time_s - self.time_s[0])
+        phases = [(frequency_hz + offset / PIECE_S) * times for offset in _TAKEN]
+        base = np.column_stack([wave(phase) for phase in phases for wave in (np.cos, np.sin)])
+        return np.asarray(terms_um - base @ np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0])
+
+
+def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0) -> tuple[VibrationMode, ...]:
+    """Vibrations in terms (n, 36) of frames at times (n,), NaN where a frame was rejected; the strongest first.
+
+    Raises ValueError if there are less than 20 s of frames.
+    """
+    good = np.isfinite(coeffs_um).all(axis=1)
+    grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
+    pieces, terms = _pieces(time_s[good], coeffs_um[good], grid_hz)
+    if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
+        raise ValueError(f"less than {LEAST_S:g} s of frames at a steady rate")
+    found: list[VibrationMode] = []
+    spectra = [piece.projected(own) for piece, own in zip(pieces, terms, strict=True)]
+    for _ in range(_MOST):
+        seen = _evidence(spectra, pieces)
+        if seen.max() < _threshold(seen, grid_hz.size):
+            break
+        k, rivals = _likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
+        frequency, sigma = _refined(seen, grid_hz, k)
+        amplitude_nm, shape = _shape([spectrum[k] for spectrum in spectra], pieces)
+        sigma = max(sigma, _scatter_hz([np.abs(spectrum @ shape) ** 2 for spectrum in spectra], grid_hz, k))
+        again = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
+        if not again:
+            evidence = float(seen[k] - np.median(seen))
+            aliases = tuple(float(grid_hz[j]) for j in rivals)
+            found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
+        taken = np.eye(shape.size) if again else np.outer(shape, shape)
+        terms = [piece.without(own, frequency, taken) for piece, own in zip(pieces, terms, strict=True)]
+        spectra = [piece.projected(own) for piece, own in zip(pieces, terms, strict=True)]
+    return tuple(found)
+
+
+def _pieces(time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray) -> tuple[list[_Piece], list[FloatArray]]:
+    """The frames in pieces, and their terms without drift."""
+    pieces, terms = [], []
+    for frames in _runs(time_s):
+        t = time_s[frames]
+        rate_hz = 1 / float(np.median(np.diff(t)))
+        alias_hz = np.abs(grid_hz - rate_hz * np.round(grid_hz / rate_hz))
+        middle, half = (t[0] + t[-1]) / 2, (t[-1] - t[0]) / 2 + 1 / rate_hz
+        window = np.cos(np.pi / 2 * (t - middle) / half) ** 2
+        waves = np.exp(-2j * np.pi * grid_hz[:, None] * (t - t[0]))
+        blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
+        pieces.append(_Piece(t, window, waves, alias_hz, blind))
+        terms.append(_without_drift(t, coeffs_um[frames]))
+    return pieces, terms
+
+
+def _runs(time_s: FloatArray) -> list[slice]:
+    """Frames of one rate without a gap, in pieces of about the same length."""
+    intervals = np.diff(time_s)
+    if intervals.size < 10:
+        return []
+    usual = ndimage.median_filter(intervals, 9, mode="nearest")
+    ends = np.flatnonzero((np.abs(np.diff(usual)) > 0.01 * usual[1:]) | (intervals[1:] > _GAP * usual[1:])) + 1
+    pieces = []
+    for first, last in pairwise([0, *(ends + 1), time_s.size]):
+        lasts_s = time_s[last - 1] - time_s[first]
+        if lasts_s >= _SHORTEST * PIECE_S:
+            edges = np.linspace(first, last, max(1, round(lasts_s / PIECE_S)) + 1).astype(int)
+            pieces += [slice(a, b) for a, b in pairwise(edges)]
+    return pieces
+
+
+def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
+    """Terms less a cubic, clipped at six robust deviations."""
+    base = np.column_stack([np.linspace(-1, 1, time_s.size) ** power for power in range(4)])
+    left = terms_um - base @ np.linalg.lstsq(base, terms_um, rcond=None)[0]
+    spread = 1.4826 * np.median(np.abs(left), axis=0)
+    return np.asarray(np.clip(left, -6 * spread, 6 * spread))
+
+
+def _evidence(spectra: list[ComplexArray], pieces: list[_Piece]) -> FloatArray:
+    """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of their noise."""
+    white = np.stack(
+        [
+            spectrum / np.sqrt(_noise(np.abs(spectrum) ** 2, piece.alias_hz))
+            for spectrum, piece in zip(spectra, pieces, strict=True)
+        ],
+        axis=1,
+    )
+    power = np.sum(np.abs(white) ** 2, axis=2)
+    quiet = white[power < np.median(power, axis=0)]  # lines, and their aliases, are in the other half
+    values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
+    kept = values > 1e-3 * values[-1]
+    alone = (white @ vectors[:, kept]) / np.sqrt(values[kept])
+    alone[np.stack([piece.blind for piece in pieces], axis=1)] = 0
+    parts = np.concatenate([alone.real, alone.imag], axis=1)
+    return np.asarray(np.linalg.eigvalsh(parts @ parts.transpose(0, 2, 1))[:, -1])
+
+
+def _noise(power: FloatArray, alias_hz: FloatArray) -> FloatArray:
+    """Noise (frequencies, 36) under the lines, a function of the alias that falls with it: drift, then white noise.
+
+    Medians over bands of half an octave (power is exponential: its median is ln 2 of its mean), none larger than that
+    of a slower band, in which a line has less to say.
+    """
+    slowest_hz = _LEAST_HZ / 2
+    edges = np.geomspace(slowest_hz, alias_hz.max() * 1.001, 3 + int(2 * np.log2(alias_hz.max() / slowest_hz)))
+    bands = [(low, high) for low, high in pairwise(edges) if np.any((alias_hz >= low) & (alias_hz < high))]
+    levels = np.array([np.median(power[(alias_hz >= low) & (alias_hz < high)], axis=0) for low, high in bands])
+    levels = np.log(np.maximum(np.minimum.accumulate(levels, axis=0) / np.log(2), 1e-30))
+    middles = np.log([np.sqrt(low * high) for low, high in bands])
+    at = np.log(np.maximum(alias_hz, slowest_hz))
+    return np.asarray(np.exp(np.column_stack([np.interp(at, middles, levels[:, j]) for j in range(power.shape[1])])))
+
+
+def _threshold(seen: FloatArray, frequencies: int) -> float:
+    """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of these quantiles."""
+    low, middle = np.quantile(seen, [0.1, 0.5])  # of the lower half, where neither lines nor their aliases are
+    order = max((1.2816 * middle / (middle - low)) ** 2, 1.0)
+    return float(middle / stats.gamma.median(order) * stats.gamma.isf(_CHANCE / frequencies, order))
+
+
+def _likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
+    """The frequency with the largest T, and others that explain the frames as well.
+
+    Of equal ones it is the one that all its pieces show, then the lowest: an alias may be missing from pieces that
+    would show it, where the true frequency has the alias of drift.
+    """
+    best = int(np.argmax(seen))
+    inner = seen[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= seen[:-2]) & (inner > seen[2:]) & (inner > seen[best] - _ALIKE))
+    apart = round(_APART_HZ * _GRID * PIECE_S)
+    alike = [best, *(int(k) for k in peaks if abs(k - best) > apart)]
+    each = {k: seen[k] / visible[k] for k in alike}
+    alike = [k for k in alike if each[k] > _MISSING * max(each.values())]
+    equal = [k for k in alike if seen[k] > max(seen[j] for j in alike) - 0.1]
+    return min(equal), sorted(set(alike) - {min(equal)})
+
+
+def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
+    """Frequency and its standard deviation from the parabola through three values of T."""
+    step = grid_hz[1] - grid_hz[0]
+    if not 0 < k < seen.size - 1:
+        return float(grid_hz[k]), float(step)
+    before, here, after = seen[k - 1 : k + 2]
+    bend = before - 2 * here + after
+    if bend >= 0:
+        return float(grid_hz[k]), float(step)
+    offset = float(np.clip((before - after) / (2 * bend), -1, 1))
+    return float(grid_hz[k] + offset * step), float(step / np.sqrt(-bend))
+
+
+def _shape(lines: list[ComplexArray], pieces: list[_Piece]) -> tuple[float, FloatArray]:
+    """Amplitude in nm and terms of unit RMS from X (36,) of each piece at the line: all its terms are in phase."""
+    waves = np.array([2 * line / piece.window.sum() for line, piece in zip(lines, pieces, strict=True)])
+    together = np.real(waves.conj().T @ waves)
+    shape = np.linalg.eigh(together)[1][:, -1]
+    shape = shape * np.sign(shape[np.argmax(np.abs(shape))])
+    return float(1e3 * np.sqrt(np.mean(np.abs(waves @ shape) ** 2))), np.asarray(shape)
+
+
+def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
+    """Standard error of the mean of the pieces' own frequencies: a damped line wanders by its width."""
+    reach = round(_APART_HZ * _GRID * PIECE_S)
+    first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
+    own = [_refined(line, grid_hz, first + int(np.argmax(line[first:last])))[0] for line in lines]
+    return float(np.std(own, ddof=1) / np.sqrt(len(own)))
