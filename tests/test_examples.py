@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,9 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.control_port.server import metrics_text
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.sim.lab import Lab
 
 EXAMPLES = sorted(Path(__file__).parents[1].glob("membrane_ctrl/examples/*.toml"))
@@ -162,3 +166,21 @@ def test_a_preset_refuses_what_its_device_does_not_have(
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert "devices.pump" in line
+
+
+def test_the_dashboard_asks_for_metrics_that_exist() -> None:
+    dashboard = json.loads(EXAMPLES[0].with_name("grafana.json").read_text())
+    status = RunStatus(TelemetryRow(*(0.0 for _ in FIELDS)))
+    served = set(re.findall(r"^(membrane_\w+)", metrics_text(status, 1, 0), re.MULTILINE))
+    panels = dashboard["panels"]
+    asked = [target["expr"] for panel in panels for target in panel["targets"]]
+    asked.append(dashboard["templating"]["list"][1]["query"]["query"])
+    for expression in asked:
+        names = set(re.findall(r"membrane_\w+", expression))
+        assert names, expression
+        assert names <= served, expression
+    places = [panel["gridPos"] for panel in panels]
+    cells = [(x, y) for p in places for x in range(p["x"], p["x"] + p["w"]) for y in range(p["y"], p["y"] + p["h"])]
+    assert len(set(cells)) == len(cells), "no panel covers another"
+    assert max(x for x, _ in cells) < 24
+    assert len({panel["id"] for panel in panels}) == len(panels)
