@@ -10,7 +10,7 @@ import numpy as np
 
 from membrane_ctrl.calibration import session as sessions
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
-from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, stated_sigmas
+from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, known_sigmas
 from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.control_port.ctl import Where
@@ -161,7 +161,7 @@ def _foreseen(
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).over(optics)
-    known = parameters.sigmas({**stated_sigmas(optics), **freed(solving.free)})
+    known = parameters.sigmas(known_sigmas(optics, freed(solving.free)))
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
         return propagate.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)

@@ -85,7 +85,7 @@ def calibrate(
         list[str] | None,
         typer.Option(
             metavar="NAME[=SIGMA]",
-            help="Calibrate this parameter as well, e.g. bow_mm; sigma 0 keeps it fixed; repeatable.",
+            help="How well this parameter is known, e.g. focal_relative=1e-4; repeatable.",
         ),
     ] = None,
     prior: PriorOption = None,

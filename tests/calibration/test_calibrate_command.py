@@ -177,7 +177,8 @@ def test_sets_of_different_rigs_are_named(
     [
         (["--free", "radius_mm"], "radius_mm is not a parameter"),
         (["--free", "bow_mm=wide"], "wide is not a number"),
-        (["--free", "bow_mm=-1"], "a sigma must be 0"),
+        (["--free", "bow_mm=-1"], "a sigma must be above 0"),
+        (["--free", "focal_relative=0"], "nothing is exact: state how well focal_relative is known"),
     ],
 )
 def test_wrong_options_are_said(

@@ -7,8 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_truth import Truth, calibrated_errors_um, errors_um, make, plain, stated_errors_um
+from calibration_truth import OPTICS, Truth, calibrated_errors_um, errors_um, make, plain, stated_errors_um
 
+from membrane_ctrl.calibration.sets import known_sigmas
+from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
@@ -136,3 +138,17 @@ def test_progress_is_told() -> None:
 def test_no_sets_is_an_error() -> None:
     with pytest.raises(ValueError, match="no capture set"):
         solve(solved(0)[0].problem(SIGMAS, ()))
+
+
+def test_what_a_set_calls_exact_has_the_tolerance_of_a_data_sheet() -> None:
+    """A focal length that is held and 0.1 % off puts the sag off by six times the claim."""
+    values = np.zeros(len(NAMES))
+    values[NAMES.index("focal_relative")] = 1e-3
+    truth = make(values, 3, points=600)
+    exact = SigmasConfig(focal_relative=0.0, pitch_relative=0.0)
+    optics = OPTICS.model_copy(update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})})
+    known = known_sigmas(optics, {"k1": 0.01})
+    assert (known["k1"], known["focal_relative"], known["pitch_relative"]) == (0.01, 0.01, 1e-3)
+    held, free = (solve(truth.problem(own)) for own in (SIGMAS, sigmas(known)))
+    assert abs(calibrated_errors_um(held, truth)[0]) > 5 * propagate(held, 2, 475.0).sag_um
+    assert abs(calibrated_errors_um(free, truth)[0]) < 2 * propagate(free, 2, 475.0).sag_um
