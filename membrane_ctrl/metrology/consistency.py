@@ -2,15 +2,17 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology import motion
+from membrane_ctrl.metrology.calibrate import residuals
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.full import LASER_NOISE_UM, FullResult
 from membrane_ctrl.metrology.optics.geometry import Outline, project
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, sag_gradient
 from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
@@ -25,6 +27,7 @@ _SIGMAS = 4.0  # of the fringes' answer: the film moved
 # Motion from x to y over its RMS among the steps of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
 _X_TO_Y = 5.0
 _STEP_MM = 0.01
+_HEAVY = 1e3  # weight of the sag beside the heights
 
 
 def blur_px(phase_rad: FloatArray, contrasts: FloatArray, index: IntArray, bin_px: int) -> float:
@@ -137,6 +140,40 @@ def rim_widening(bench: TrialBench, spread: GeometrySpread, outline: Outline | N
     return max(1.0, far / 2)
 
 
+@cache
+def _alike() -> FloatArray:
+    """(36, k) parameters of the surfaces most like the round terms beyond the 36, with their sag."""
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
+    inside = np.hypot(x, y) <= 1
+    rows, (heights, _, _) = residuals.basis(x[inside], y[inside])[0].T, residuals.round_basis(x[inside], y[inside])
+    rim = residuals.round_basis(np.ones(1), np.zeros(1))[0]
+    table = np.vstack([rows, _HEAVY * sag_gradient()])
+    return np.asarray(np.linalg.lstsq(table, np.vstack([heights.T, _HEAVY * rim.T]), rcond=None)[0])
+
+
+def law_effect(patches: budget.Patches, radius_mm: float, inverse: FloatArray) -> FloatArray:
+    """(36,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its residual slopes show it.
+
+    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the 36 terms and the excess. The
+    slopes' least squares take some of that for other terms, and the rest is missing from the sag.
+    """
+    x, y = patches.places_mm / radius_mm
+    _, *of = residuals.basis(x, y)
+    _, *beyond = residuals.round_basis(x, y)
+    absorbed = inverse @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True)) / radius_mm**2
+    left = np.hstack([b - absorbed.T @ a for a, b in zip(of, beyond, strict=True)]).T
+    weights = np.sqrt(np.tile(patches.count, 2))
+    seen = radius_mm * patches.slopes.ravel()
+    amounts_mm = np.linalg.lstsq(left * weights[:, None], seen * weights, rcond=None)[0]
+    return np.asarray((absorbed - _alike()) @ amounts_mm)
+
+
+def _law(full: FullResult) -> budget.Source:
+    effect = law_effect(budget.Patches.of_grid(full.grid), full.surface.radius_mm, full.fit.normal.inverse)
+    says = "film that is not Hencky's: round slopes that no term explains"
+    return budget.Source("film_law", says, math.nan, effect[:, None])
+
+
 @dataclass(frozen=True)
 class Examined:
     """Budget of a figure, and what makes it doubtful."""
@@ -175,6 +212,7 @@ def examine(
         *budget.bench_sources(bench, sigmas),
         *film,
         _vertex(bench, sigmas, checked),
+        _law(full),
         blur,
         *budget.frame_sources(bench, optics, shifts, _film_um(checked)),
         *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),

@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
+from membrane_ctrl.metrology.zonal import ResidualGrid
 from membrane_ctrl.model.arrays import FloatArray
 
 _GLASS_INDEX = 1.5
@@ -292,54 +293,46 @@ def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float
     middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
     noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
-    left = _left_in_cells(full, inverse)
+    left = Patches.of_grid(full.grid).effects(full.surface.radius_mm, inverse)
     share = max(0.0, 1 - float(np.sum(noise**2)) / max(float(np.sum(left**2)), 1e-300))
     left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
     yield Source("slope_urad", says, left_urad, math.sqrt(share) * left, common=False)
 
 
-def _left_in_cells(full: FullResult, inverse: FloatArray) -> FloatArray:
-    grid, reach_mm = full.grid, float(full.grid.axis_mm[-1])
-    x, y = np.meshgrid(grid.axis_mm, grid.axis_mm)
-    seen = grid.count > 0
-    slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
-    places_mm = np.stack([x[seen], y[seen]])
-    return left_effects(places_mm, grid.count[seen], slopes, reach_mm, full.surface.radius_mm, inverse)
+@dataclass(frozen=True)
+class Patches:
+    """Means of residual slopes over patches of the mirror."""
 
+    places_mm: FloatArray  # (2, patches)
+    count: FloatArray  # (patches,): points in each
+    slopes: FloatArray  # (2, patches)
 
-def left_effects(
-    places_mm: FloatArray,
-    count: FloatArray,
-    slopes: FloatArray,
-    reach_mm: float,
-    radius_mm: float,
-    inverse: FloatArray,
-) -> FloatArray:
-    """Effects (36, patches) on the parameters if residual slopes are independent from patch to patch only.
+    @classmethod
+    def of(cls, places_mm: FloatArray, count: FloatArray, slopes: FloatArray, reach_mm: float) -> "Patches":
+        """Of points that stand for `count` (n,) each, over a square of half the side `reach_mm`."""
+        column, row = np.clip(((places_mm / reach_mm + 1) / 2 * _PATCHES).astype(int), 0, _PATCHES - 1)
+        patch = row * _PATCHES + column
+        sums = [np.bincount(patch, count * part, _PATCHES**2) for part in (np.ones_like(count), *places_mm, *slopes)]
+        means = np.array(sums[1:]) / np.maximum(sums[0], 1.0)
+        return cls(means[:2], sums[0], means[2:])
 
-    The patches are those of the mirror, whatever was seen: two sets of a bench have the same ones.
+    @classmethod
+    def of_grid(cls, grid: ResidualGrid) -> "Patches":
+        """Of a measured set."""
+        seen, (x, y) = grid.count > 0, np.meshgrid(grid.axis_mm, grid.axis_mm)
+        slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
+        return cls.of(np.stack([x[seen], y[seen]]), grid.count[seen], slopes, float(grid.axis_mm[-1]))
 
-    Parameters
-    ----------
-    places_mm, slopes : (2, n) arrays
-        Where, and the residual slopes in x and y there.
-    count : (n,) array
-        Points that each of them stands for.
-    reach_mm, radius_mm : float
-        The patches cover a square of this half side; radius of the terms.
-    inverse : (36, 36) array
-        Of the fit's normal matrix.
-    """
-    column, row = np.clip(((places_mm / reach_mm + 1) / 2 * _PATCHES).astype(int), 0, _PATCHES - 1)
+    def effects(self, radius_mm: float, inverse: FloatArray) -> FloatArray:
+        """(36, patches) on the parameters if the residual slopes are independent from patch to patch only.
 
-    def summed(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(row * _PATCHES + column, count * values, _PATCHES**2), float)
-
-    points = np.maximum(summed(np.ones_like(count)), 1.0)
-    middle = [summed(place) / points / radius_mm for place in places_mm]
-    _, of_x, of_y = residuals.basis(*middle)
-    return np.asarray(inverse @ ((of_x * summed(slopes[0]) + of_y * summed(slopes[1])) / radius_mm))
+        The patches are those of the mirror, whatever was seen: two sets of a bench have the same ones. `inverse` is
+        that of the fit's normal matrix.
+        """
+        _, of_x, of_y = residuals.basis(*self.places_mm / radius_mm)
+        x, y = self.count * self.slopes
+        return np.asarray(inverse @ ((of_x * x + of_y * y) / radius_mm))
 
 
 def slope_variance(

@@ -219,14 +219,10 @@ class ErrorWatch:
     def _sensitivities(self, cycle: Cycle, asked: IntArray, seen: FramesSeen) -> LiveErrors:
         tracer, state, fit = cycle.tracer, cycle.state, cycle.fit
         field = tracer.slope_field(state.points, fit.surface)
-        left = budget.left_effects(
-            field[:2],
-            state.points.weights,
-            field[2:4] - field[4:6],
-            self._optics.mirror.analysis_radius_mm,
-            tracer.radius_mm,
-            fit.normal.inverse,
-        )
+        reach_mm, slopes = self._optics.mirror.analysis_radius_mm, field[2:4] - field[4:6]
+        patches = budget.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
+        law = consistency.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
+        left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
         levels = [w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)]
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
         phases = np.full((2, self._places_px.shape[1]), np.nan)
