@@ -154,8 +154,8 @@ def _alike() -> FloatArray:
 def law_effect(patches: budget.Patches, radius_mm: float, inverse: FloatArray) -> FloatArray:
     """(36,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its residual slopes show it.
 
-    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the 36 terms and the excess. The
-    slopes' least squares take some of that for other terms, and the rest is missing from the sag.
+    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the 36 terms and the excess.
+    Least squares take some of that for other terms, and the rest is missing from the sag.
     """
     x, y = patches.places_mm / radius_mm
     _, *of = residuals.basis(x, y)
@@ -171,7 +171,7 @@ def law_effect(patches: budget.Patches, radius_mm: float, inverse: FloatArray) -
 def _law(full: FullResult) -> budget.Source:
     effect = law_effect(budget.Patches.of_grid(full.grid), full.surface.radius_mm, full.fit.normal.inverse)
     says = "film that is not Hencky's: round slopes that no term explains"
-    return budget.Source("film_law", says, math.nan, effect[:, None])
+    return budget.Source("film_law", says, math.nan, effect[:, None], common=False)
 
 
 @dataclass(frozen=True)

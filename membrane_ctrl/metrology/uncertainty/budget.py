@@ -315,7 +315,7 @@ class Patches:
         patch = row * _PATCHES + column
         sums = [np.bincount(patch, count * part, _PATCHES**2) for part in (np.ones_like(count), *places_mm, *slopes)]
         means = np.array(sums[1:]) / np.maximum(sums[0], 1.0)
-        return cls(means[:2], sums[0], means[2:])
+        return cls(means[:2], np.asarray(sums[0], float), means[2:])
 
     @classmethod
     def of_grid(cls, grid: ResidualGrid) -> "Patches":
