@@ -71,7 +71,7 @@ def hold(
 ) -> HeldCentre:
     """Hold the simulated mirror on the estimate; a laser is there for the first 10 s, then if `sensors` says so."""
     plant = Plant(twin, true_pump, events)
-    controller, centre = InnerLoop(loop, PumpConfig(), config.gain_per_s), CentreFilter(config, loop)
+    controller, centre = InnerLoop(loop, PumpConfig(), config), CentreFilter(config, loop)
     dt_s = 1 / loop.rate_hz
     first = plant.sample().displacement_um
     leak_um_per_s = plant.truth().leak_um_per_s

@@ -247,7 +247,7 @@ class EstimatorConfig(Section):
     process_value: Literal["laser", "estimate"] = "laser"
     """What the inner loop holds: the laser's reading, or the estimate of the centre. Change it to hold with the
     optics."""
-    gain_per_s: Annotated[float, Field(gt=0, le=20)] = 8.0
+    gain_per_s: Annotated[float, Field(gt=0, le=20)] = 10.0
     """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is uncertain."""
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08
     """Dead time from command to gas. Change it to what `tune` found."""
@@ -265,12 +265,12 @@ class EstimatorConfig(Section):
     """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
     air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
     """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
-    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.01
+    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.06
     """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.025
     """Unrest of the leak: a larger one answers a new leak sooner and passes more noise.
     Change it with the measured peak after a leak."""
-    leak_walk_optics_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.15
+    leak_walk_optics_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     """The same while the optics are there, whose noise is smaller. Change it likewise."""
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
     """Walk of the laser's mount: 0.2 um in an hour. Change it to your mount's."""

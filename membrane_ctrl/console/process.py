@@ -44,6 +44,7 @@ def line(view: model.ConsoleView) -> str:
         f"error {why.number(row.error_um, 2, sign=True):>7} um",
         f"pump {why.percent(row.pump_fraction):>5}",
         f"leak {why.number(row.leak_um_per_s, 2)} um/s" + (" TOO TIGHT" if view.too_tight else ""),
+        *([f"held by {why.holders(row)}"] if math.isfinite(row.estimate_sigma_um) else []),
         f"shape {_shape_words(view)} trim {why.number(shape.trim_um, 2, sign=True)} um",
         f"late {why.number(row.lateness_ms, 1)} ms",
         view.why,

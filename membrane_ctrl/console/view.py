@@ -12,7 +12,7 @@ from rich.text import Text
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
 from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
-from membrane_ctrl.console.why import NONE, duration, number, percent
+from membrane_ctrl.console.why import NONE, duration, holders, number, percent
 from membrane_ctrl.model import states, telemetry
 
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
@@ -226,6 +226,8 @@ def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[t
 def _mirror(row: telemetry.TelemetryRow) -> Text:
     text = Text.assemble("reading ", (number(row.displacement_um, 2, sign=True), "bold"))
     text.append(f"  setpoint {number(row.setpoint_um, 2, 'um', sign=True)}")
+    if math.isfinite(row.estimate_sigma_um):
+        text.append(f"  centre ± {number(row.estimate_sigma_um, 3, 'um')} by {holders(row)}", style="green")
     if math.isfinite(row.truth_displacement_um):
         text.append(f"  truth {number(row.truth_displacement_um, 2, 'um', sign=True)}", style="cyan")
         text.append(f" (laser {number(row.truth_laser_bias_um, 2, sign=True)})", style="dim")

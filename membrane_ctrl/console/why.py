@@ -29,6 +29,19 @@ _GO_ON = {
 _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
+def holders(row: TelemetryRow) -> str:
+    """The sensors that the estimate of the centre follows: laser and optics with their shares of its corrections."""
+    shares = {
+        "laser": 1.0 - row.optics_share,
+        "optics": row.optics_share,
+        "barometer": math.nan,
+        "thermometer": math.nan,
+    }
+    seeing = [name for name in shares if math.isfinite(getattr(row, f"{name}_innovation"))]
+    words = (f"{name} {percent(shares[name])}" if math.isfinite(shares[name]) else name for name in seeing)
+    return ", ".join(words) or "nothing"
+
+
 def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
     state, rung = State(int(row.state)), Rung(int(row.rung))
@@ -36,7 +49,8 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
         return f"{_RUNGS[rung]}: {fault or told or 'unknown fault'}"
     if state in _STATES:
         return told or _STATES[state]
-    if not (math.isfinite(row.displacement_um) and math.isfinite(row.filtered_um)):
+    sees = math.isfinite(row.displacement_um) or math.isfinite(row.estimate_sigma_um)
+    if not (sees and math.isfinite(row.filtered_um)):
         return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
     if told.startswith("paused"):
         return told

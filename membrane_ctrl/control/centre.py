@@ -90,6 +90,8 @@ class CentreEstimate:
         Displacement of the laser's mount: the true centre is `um - mount_um`.
     ahead_um : float
         Where the gas in transit takes it, if the pump from now on balances `drift_um_per_s`.
+    due_um_per_s : float
+        Flow at the end of the dead time, less `drift_um_per_s`.
     leak_um_per_s, drift_um_per_s : float
         Loss of gas, and that less the lift of the warming gas.
     sensors : tuple of SensorView
@@ -102,10 +104,20 @@ class CentreEstimate:
     sigma_um: float
     mount_um: float
     ahead_um: float
+    due_um_per_s: float
     leak_um_per_s: float
     drift_um_per_s: float
     sensors: tuple[SensorView, ...]
     jumped: tuple[str, ...] = ()
+
+    def telemetry(self) -> dict[str, float]:
+        """What a telemetry row says of it."""
+        told = {
+            f"{sensor.name.lower()}_innovation": view.innovation
+            for sensor, view in zip(Sensor, self.sensors, strict=True)
+            if view.fresh
+        }
+        return {"estimate_sigma_um": self.sigma_um, "optics_share": self.sensors[Sensor.OPTICS].share, **told}
 
 
 class Transit:
@@ -136,6 +148,14 @@ class Transit:
         """Rise still to come, if from now on the pump gives the drift."""
         pending = self._period_s * (sum(islice(self._flows, self._ticks)) + self._rest * self._flows[self._ticks])
         return pending - drift_um_per_s * self._delay_s + self._lag_s * (self._arriving - drift_um_per_s)
+
+    def due_um_per_s(self) -> float:
+        """Flow at the end of the dead time: what the pump now receives comes on top of it."""
+        flow = self._arriving
+        for late in range(self._ticks, -1, -1):
+            step_s = self._period_s * (self._rest if late == self._ticks else 1.0)
+            flow += smoothing(step_s, self._lag_s) * (self._flows[late] - flow)
+        return flow
 
 
 @dataclass(slots=True)
@@ -412,6 +432,7 @@ class CentreFilter:
             sigma_um=math.sqrt(variance),
             mount_um=float(x[_MOUNT]),
             ahead_um=um + self._transit.coming_um(drift),
+            due_um_per_s=self._transit.due_um_per_s() - drift,
             leak_um_per_s=float(x[_LEAK]),
             drift_um_per_s=drift,
             sensors=tuple(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control import centre, film_health, filters, gas, pid, pump_drift
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
@@ -56,9 +56,13 @@ class InnerLoop:
     a bump.
     """
 
-    def __init__(self, loop: LoopConfig, pump: PumpConfig, estimate_gain_per_s: float = 0.0) -> None:
+    def __init__(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig = EstimatorConfig()) -> None:  # noqa: B008 (frozen)
         self._loop = loop
-        self._estimate_gain_per_s = estimate_gain_per_s
+        lag_s = estimator.pump_lag_s
+        fast_per_s = max(estimator.gain_per_s, 1 / lag_s) if lag_s > 0 else 0.0
+        # both poles of the loop: its own and the pump's, or faster than that (docs/estimator.md)
+        self._error_gain_per_s = lag_s * estimator.gain_per_s * fast_per_s if lag_s > 0 else estimator.gain_per_s
+        self._due_gain = (1 - lag_s * estimator.gain_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = min(loop.flow_max_um_per_s, pump.flow_full_um_per_s)
         self._measured = filters.LowPass(loop.measurement_filter_s)
@@ -166,7 +170,7 @@ class InnerLoop:
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
         self._matched.reset(shaped_um)
         self._pid.place(estimate.leak_um_per_s)
-        p_um_per_s = self._estimate_gain_per_s * (shaped_um - estimate.ahead_um)
+        p_um_per_s = self._error_gain_per_s * (shaped_um - estimate.ahead_um) + self._due_gain * estimate.due_um_per_s
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
         return terms, estimate.drift_um_per_s - estimate.leak_um_per_s + ramp_um_per_s
 

@@ -48,7 +48,7 @@ class Controller:
         self._safety = safety.SafetyTable(config.limits)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
         observer = Observer(config.limits)
-        loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator.gain_per_s)
+        loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
         self._scene = Scene(
             config, config.loop, config.pump, loop, observer, levels, standstill, config.loop.setpoint_um

@@ -110,6 +110,7 @@ def telemetry_row(
     """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
     reading = inputs.reading or _NO_READING
     out = scene.output or inner_loop.NO_OUTPUT
+    seen = scene.estimate.telemetry() if scene.estimate else {}
     return telemetry.TelemetryRow(
         mono_s=inputs.now_s,
         tick=number,
@@ -146,4 +147,5 @@ def telemetry_row(
         trim_um=shape.trim_um,
         truth_displacement_um=inputs.truth_displacement_um,
         truth_laser_bias_um=inputs.truth_laser_bias_um,
+        **seen,
     )

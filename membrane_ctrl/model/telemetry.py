@@ -4,6 +4,7 @@ A row crosses to the other processes as plain doubles, so that writing it costs 
 Codes (state, shape state, fault, rung) are small integers; their names are in `states.py`.
 """
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -53,6 +54,13 @@ class TelemetryRow:
     trim_um: float
     truth_displacement_um: float  # twin only: the centre's true displacement
     truth_laser_bias_um: float  # twin only
+    # the estimate of the centre (docs/estimator.md), which `filtered_um` then is; NaN if the laser is held
+    estimate_sigma_um: float = math.nan
+    optics_share: float = math.nan  # of the corrections of the estimate; the laser has the rest
+    laser_innovation: float = math.nan  # reading less expectation, in standard deviations; NaN while it is not used
+    optics_innovation: float = math.nan
+    barometer_innovation: float = math.nan
+    thermometer_innovation: float = math.nan
 
     def pack(self) -> bytes:
         """The row as doubles in field order."""
@@ -68,6 +76,7 @@ FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
+FIRST_BYTES = 8 * FIELDS.index("estimate_sigma_um")  # of a row of the first version, which had no estimate
 
 
 # A mirror counts as settled this long after hold began and after each setpoint ramp: three closed-loop time constants

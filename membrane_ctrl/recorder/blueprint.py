@@ -106,6 +106,9 @@ _TICKS = "every tick around events, else one a second"
 
 def _loop(config: Config) -> rrb.Vertical:
     learned = [_plot("Pump against its curve", streams.PUMP.path)] if config.pump.probe_um else []
+    if config.estimator.process_value == "estimate":
+        learned.append(_plot("Estimate of the centre, 1 sigma, µm", "/estimate/sigma"))
+        learned.append(_plot("Innovations in standard deviations", "/estimate/innovations", "/estimate/optics_share"))
     return rrb.Vertical(
         _around_band(config, f"Error and band, {_TICKS}, µm", "/loop/error", "/truth/error"),
         _plot("Setpoint, reading and true centre, µm", "/loop/position", "/truth/displacement"),

@@ -95,6 +95,17 @@ STREAMS: tuple[Stream, ...] = (
             Line("vent_readback_fraction", "vent read-back", VIOLET, 1.0),
         ),
     ),
+    Stream("/estimate/sigma", (Line("estimate_sigma_um", "estimate of the centre, 1 sigma µm", BLUE),)),
+    Stream(
+        "/estimate/innovations",
+        (
+            Line("laser_innovation", "laser", GREY, 1.0),
+            Line("barometer_innovation", "barometer", ORANGE, 1.0),
+            Line("thermometer_innovation", "thermometer", RED, 1.0),
+            Line("optics_innovation", "optics", BLUE),
+        ),
+    ),
+    Stream("/estimate/optics_share", (Line("optics_share", "share of the optics", BLUE),)),
     Stream("/shape/trim", (Line("trim_um", "trim µm", VIOLET, 2.0),)),
     Stream("/gas/pressure", (Line("gauge_pressure_pa", "gauge pressure Pa", BLUE),)),
     Stream("/ambient/pressure", (Line("ambient_pressure_pa", "ambient pressure Pa", ORANGE),)),
