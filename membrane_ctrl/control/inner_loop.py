@@ -128,13 +128,14 @@ class InnerLoop:
         if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
+        known_um_per_s = weather_um_per_s
         if given.estimate is None:
-            terms, known_um_per_s = self._on_laser(given, dt_s)
-            known_um_per_s += weather_um_per_s
+            terms, ramp_um_per_s = self._on_laser(given, dt_s)
         else:
-            terms, known_um_per_s = self._on_estimate(given, given.estimate, dt_s)
+            terms, ramp_um_per_s = self._on_estimate(given, given.estimate, dt_s)
+            known_um_per_s = given.estimate.drift_um_per_s - given.estimate.leak_um_per_s
         filtered_um = self._measured.value
-        wanted_um_per_s = terms.sum_um_per_s + known_um_per_s
+        wanted_um_per_s = terms.sum_um_per_s + known_um_per_s + ramp_um_per_s
         probing = (
             self.may_probe and self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
         )
@@ -148,7 +149,7 @@ class InnerLoop:
         else:
             self._drift.spoil()
         self._leak.update(self._flow(fraction), weather_um_per_s, filtered_um, dt_s)
-        return self._output(terms, known_um_per_s, wanted_um_per_s, fraction, filtered_um)
+        return self._output(terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
 
     def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
@@ -161,7 +162,7 @@ class InnerLoop:
     def _on_estimate(
         self, given: LoopInput, estimate: centre.CentreEstimate, dt_s: float
     ) -> tuple[pid.PidTerms, float]:
-        """P on the centre that the gas in transit leads to; the estimated leak is the integrator.
+        """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is the integrator.
 
         The prediction takes dead time and lag out of the loop, and the filter, which knows the flow after its limits,
         cannot wind up. Everything that `_on_laser` needs follows, so that either may take over at any tick.
@@ -172,7 +173,7 @@ class InnerLoop:
         self._pid.place(estimate.leak_um_per_s)
         p_um_per_s = self._error_gain_per_s * (shaped_um - estimate.ahead_um) + self._due_gain * estimate.due_um_per_s
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
-        return terms, estimate.drift_um_per_s - estimate.leak_um_per_s + ramp_um_per_s
+        return terms, ramp_um_per_s
 
     def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
