@@ -31,14 +31,13 @@ _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 def holders(row: TelemetryRow) -> str:
     """The sensors that the estimate of the centre follows: laser and optics with their shares of its corrections."""
-    shares = {
-        "laser": 1.0 - row.optics_share,
-        "optics": row.optics_share,
-        "barometer": math.nan,
-        "thermometer": math.nan,
+    seeing = {
+        f"laser {percent(1.0 - row.optics_share)}": row.laser_innovation,
+        f"optics {percent(row.optics_share)}": row.optics_innovation,
+        "barometer": row.barometer_innovation,
+        "thermometer": row.thermometer_innovation,
     }
-    seeing = [name for name in shares if math.isfinite(getattr(row, f"{name}_innovation"))]
-    words = (f"{name} {percent(shares[name])}" if math.isfinite(shares[name]) else name for name in seeing)
+    words = (name for name, innovation in seeing.items() if math.isfinite(innovation))
     return ", ".join(words) or "nothing"
 
 

@@ -9,7 +9,7 @@ import pytest
 from console_feed import HOLDING
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import why
+from membrane_ctrl.console.why import holders, why
 from membrane_ctrl.model.states import Rung, State
 from membrane_ctrl.model.telemetry import TelemetryRow
 
@@ -75,3 +75,17 @@ def test_there_is_always_a_line(state: State, rung: Rung) -> None:
     said = why(empty, "", "", CONFIG)
     assert "pump" in said
     assert "nan" not in said
+
+
+def test_the_sensors_that_hold_the_mirror_are_named_with_their_shares() -> None:
+    row = replace(HOLDING, estimate_sigma_um=0.02, optics_share=0.93, laser_innovation=-0.4, optics_innovation=0.1)
+    assert holders(row) == "laser 7 %, optics 93 %"
+    assert holders(replace(row, laser_innovation=math.nan, optics_share=1.0, barometer_innovation=0.0)) == (
+        "optics 100 %, barometer"
+    )
+    assert holders(replace(row, laser_innovation=math.nan, optics_innovation=math.nan)) == "nothing"
+
+
+def test_a_mirror_held_by_the_optics_alone_is_not_called_unheld() -> None:
+    assert "mean flow" in line(displacement_um=math.nan)
+    assert "mean flow" not in line(displacement_um=math.nan, estimate_sigma_um=0.02)
