@@ -148,6 +148,16 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
 }
 
 
+def _fleet(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file with a table [[holds]] for each.")],
+    json: JsonOption = False,
+) -> int:
+    """Show the status of several holds, a line each."""
+    from membrane_ctrl.control_port.ctl import fleet_status
+
+    return fleet_status(file, json)
+
+
 def add_actions() -> None:
     """Add the commands of `ctl`. Other commands need not wait for the controller's table."""
     from membrane_ctrl.controller.commands import TABLE
@@ -155,6 +165,7 @@ def add_actions() -> None:
     if ctl_app.registered_commands:
         return
     _add("status", "Show the status once.", _plain)
+    ctl_app.command("fleet")(_fleet)
     _add("watch", "Print a status line repeatedly until the run ends.", _watch)
     for kind, rule in TABLE.items():
         if kind in _OWN or not (rule.needs or kind.startswith("shape_")):  # `tune` is a separate command

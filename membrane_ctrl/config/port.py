@@ -52,6 +52,44 @@ class PortConfig(Section):
         return Path(self.socket) if self.socket else logs_dir / SOCKET_NAME
 
 
+class FleetHold(Section):
+    """One of several holds, here or on another host."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,40}$")]
+    """Name in lists."""
+    socket: str | None = None
+    """Socket file of a hold on this machine."""
+    tls: str = ""
+    """HOST:PORT of a hold elsewhere, with the three files below."""
+    certificate_file: str | None = None
+    """Our certificate."""
+    key_file: str | None = None
+    """Its key."""
+    authority_file: str | None = None
+    """CA of the hold's certificate."""
+
+    @model_validator(mode="after")
+    def _one_place(self) -> "FleetHold":
+        if bool(self.socket) == bool(self.tls):
+            raise ValueError("give either socket or tls")
+        if self.tls and not (self.certificate_file and self.key_file and self.authority_file):
+            raise ValueError("tls needs certificate_file, key_file and authority_file")
+        return self
+
+
+class FleetConfig(Section):
+    """A fleet file: `[[holds]]`, each with a name (docs/control-port.md)."""
+
+    holds: Annotated[tuple[FleetHold, ...], Field(min_length=1, max_length=100)]
+    """The holds."""
+
+    @model_validator(mode="after")
+    def _told_apart(self) -> "FleetConfig":
+        if len({hold.name for hold in self.holds}) < len(self.holds):
+            raise ValueError("holds: two have the same name")
+        return self
+
+
 class WebConfig(Section):
     """The page (docs/web.md), which a hold with this table starts and keeps alive."""
 

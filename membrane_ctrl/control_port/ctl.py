@@ -4,15 +4,16 @@ import json
 import sys
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.config.port import SOCKET_NAME
-from membrane_ctrl.config.toml_file import read_toml
+from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
+from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.model import errors, files, plain_json, run_status
+from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,55 @@ def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
             state = f"; the state was {answer['state']}" if "state" in answer else ""
             print(f"{action}: done{state}", file=sys.stderr)
     return errors.Exit.DONE
+
+
+def fleet(file: Path) -> dict[str, Where]:
+    """The holds of a fleet file by name; file names are relative to its folder. Raises InputError."""
+
+    def beside(name: str | None) -> Path | None:
+        return None if name is None else file.resolve().parent / Path(name).expanduser()
+
+    found = {}
+    for hold in load(file, FleetConfig).holds:
+        socket = beside(hold.socket)
+        files = (beside(hold.certificate_file), beside(hold.key_file), beside(hold.authority_file))
+        found[hold.name] = Where(socket, None, hold.tls, *files, logs=socket.parent if socket else Path("logs"))
+    return found
+
+
+def fleet_status(file: Path, as_json: bool) -> int:
+    """Ask all holds of a fleet file at once, and print a line of each; `DEVICE_FAILED` if one does not answer."""
+    places = fleet(file)
+    with ThreadPoolExecutor(len(places)) as pool:
+        answers = dict(zip(places, pool.map(_status_of, places.values()), strict=True))
+    if as_json:
+        print(json.dumps(answers))
+    else:
+        width = max(map(len, places))
+        for name, status in answers.items():
+            print(terminal.one_line(f"{name:{width}}  {fleet_line(status)}"))
+    silent = any("problem" in status for status in answers.values())
+    return errors.Exit.DEVICE_FAILED if silent else errors.Exit.DONE
+
+
+def _status_of(where: Where) -> dict[str, Any]:
+    try:
+        with connected(where, notice=lambda _: None) as client:
+            answer = client.ask(do="status")
+    except errors.CommandError as error:
+        return {"problem": "; ".join(error.lines)}
+    return dict(answer["status"]) if answer.get("ok") else {"problem": str(answer.get("refused"))}
+
+
+def fleet_line(status: dict[str, Any]) -> str:
+    """A hold's status in one line: state, error, and what is wrong or why it is as it is."""
+    if "problem" in status:
+        return f"{'no contact':10}{'':14}{status['problem']}"
+    row, fault = status.get("row") or {}, status.get("fault")
+    notices = [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    words = [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
+    words += notices or [str(status.get("why") or "as it should be")]
+    return f"{status['state']:10}{_shown(row.get('error_um'))} um {'; '.join(words)}"
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:

@@ -23,6 +23,7 @@ def web(
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the runs.")] = Path("logs"),
     socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
     run: Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")] = None,
+    fleet: Annotated[Path | None, typer.Option("--fleet", help="File with several holds; see `ctl fleet`.")] = None,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
     name: Annotated[list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")] = None,
@@ -36,7 +37,7 @@ def web(
         return
     from membrane_ctrl.config.port import WebConfig
     from membrane_ctrl.config.toml_file import parse
-    from membrane_ctrl.control_port.ctl import Where
+    from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.child import end_with_parent
 
     try:
@@ -50,7 +51,7 @@ def web(
     page = parse(given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web")
     if with_hold:
         end_with_parent()
-    serve(Where(socket, run, logs=logs), page)
+    serve({"": ctl.Where(socket, run, logs=logs)} if fleet is None else ctl.fleet(fleet), page)
 
 
 @app.command("add-user")

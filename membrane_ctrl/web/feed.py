@@ -108,6 +108,11 @@ class HoldFeed:
         self._thread = threading.Thread(target=self._follow, name="hold feed", daemon=True)
 
     @property
+    def logs(self) -> Path | None:
+        """Folder of the runs, if it is on this machine."""
+        return None if self._where.tls else self._where.logs
+
+    @property
     def folder(self) -> Path | None:
         """Folder of the run, if it is on this machine."""
         if self._where.tls or not self.seen.name:

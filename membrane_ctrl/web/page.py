@@ -2,8 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 from nicegui import ui
@@ -11,7 +10,7 @@ from nicegui import ui
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
-from membrane_ctrl.web.panels import runs_panel, tuning_panel
+from membrane_ctrl.web.panels import alarms_of, fleet_panel, runs_panel, tuning_panel
 
 _LOOK_S = 0.5
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
@@ -28,9 +27,10 @@ _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate"
 class WebPage:
     """The elements of a viewer's page, and what it is set to show."""
 
-    def __init__(self, feeds: Sequence[HoldFeed], logs: Path, user: WebUser) -> None:
-        self._feeds, self._logs, self._user = feeds, logs, user
-        self._feed = feeds[0]
+    def __init__(self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser) -> None:
+        self._feeds, self._hold, self._user = feeds, hold, user
+        self._feed = feeds[hold]
+        self._logs = self._feed.logs
         self._utc = True
         self._span, self._signal = "10 min", SIGNALS[0]
         self._removed = "nothing"
@@ -52,15 +52,20 @@ class WebPage:
                     'flat round color=white aria-label="dark"'
                 )
                 ui.label(f"{self._user.name} ({self._user.role})").classes("text-caption")
+        if len(self._feeds) > 1:
+            fleet_panel(self._feeds)
         with ui.tabs().classes("w-full") as tabs:
             now, look_back, tune = ui.tab("Now"), ui.tab("Look back"), ui.tab("Tune")
+            for tab in (look_back, tune):
+                tab.set_visibility(self._logs is not None)  # the runs of a hold elsewhere are there
         with ui.tab_panels(tabs, value=now).classes("w-full"):
             with ui.tab_panel(now):
                 self._build_now()
-            with ui.tab_panel(look_back):
-                runs_panel(self._logs, self._user, lambda: self._utc)
-            with ui.tab_panel(tune):
-                tuning_panel(self._logs)
+            if self._logs is not None:
+                with ui.tab_panel(look_back):
+                    runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
+                with ui.tab_panel(tune):
+                    tuning_panel(self._logs)
         ui.keyboard(on_key=self._key)
         ui.timer(_LOOK_S, self._look)
 
@@ -152,11 +157,11 @@ class WebPage:
         status, row = seen.status, seen.status.get("row") or {}
         silent = seen.silent
         state = "no contact" if silent else str(status.get("state", "-"))
-        self._name.set_text(seen.name or "no hold")
+        self._name.set_text(" ".join(part for part in (self._hold, seen.name or "no hold") if part))
         self._state.set_text(state)
         self._state.props(f"color={'grey' if silent else _COLOURS.get(state, 'warning')}")
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
-        self._alarm.set_text(_alarms(status))
+        self._alarm.set_text(alarms_of(status))
         for _, field, _, digits in _FIGURES:
             value = row.get(field)
             self._numbers[field].set_text("-" if value is None or silent else f"{value:z.{digits}f}")
@@ -201,11 +206,3 @@ class WebPage:
             return
         said = await asyncio.to_thread(self._feed.ask, asked)
         ui.notify(said, type="positive" if said.endswith(": done") else "negative", timeout=8000)
-
-
-def _alarms(status: dict[str, Any]) -> str:
-    """The fault, the maintenance notices and what the recording lacks, in one line."""
-    fault = status.get("fault")
-    lines = [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
-    lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
-    return "; ".join(lines)

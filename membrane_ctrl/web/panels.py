@@ -1,13 +1,15 @@
-"""Two tabs of the page: the runs with their reports and timelines, and the newest tuning session."""
+"""Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""
 
 import asyncio
 import math
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from nicegui import ui
@@ -18,11 +20,55 @@ from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import LiveReader
 from membrane_ctrl.web.access import WebUser, outranks
+from membrane_ctrl.web.feed import HoldFeed
 from membrane_ctrl.web.figures import sparkline
 
 _POINTS = 80
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
+_LOOK_S = 1.0
+
+
+def alarms_of(status: Mapping[str, Any]) -> str:
+    """The fault, the maintenance notices and what the recording lacks, in one line."""
+    fault = status.get("fault")
+    lines = [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
+    lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    return "; ".join(lines)
+
+
+def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
+    """A row of the fleet's table for each hold."""
+    rows: list[dict[str, object]] = []
+    for name, feed in feeds.items():
+        seen = feed.seen
+        if seen.silent:
+            rows.append({"hold": name, "state": "no contact", "error": None, "says": seen.silent})
+            continue
+        error_um = (seen.status.get("row") or {}).get("error_um")
+        says = alarms_of(seen.status) or seen.status.get("why") or "as it should be"
+        error = None if error_um is None else round(error_um, 2)
+        rows.append({"hold": name, "state": seen.status.get("state"), "error": error, "says": says})
+    return rows
+
+
+def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
+    """The table of all holds; a click on a name opens its page."""
+    labels = {"hold": "mirror", "state": "state", "error": "error, um", "says": "alarms, or why"}
+    columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in labels.items()]
+    table = ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold").classes("w-full").props("dense")
+    table.add_slot(
+        "body-cell-hold",
+        '<q-td :props="props"><a class="underline" :href="\'/?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a></q-td>',
+    )
+
+    def look() -> None:
+        rows = fleet_rows(feeds)
+        if rows != table.rows:
+            table.rows = rows
+            table.update()
+
+    ui.timer(_LOOK_S, look)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +114,7 @@ def report_problem(folder: Path, user: WebUser) -> str:
     return _command("report", str(folder))
 
 
-def runs_panel(logs: Path, user: WebUser, utc: Callable[[], bool]) -> None:
+def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) -> None:
     """Fill the tab."""
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
@@ -99,7 +145,7 @@ def runs_panel(logs: Path, user: WebUser, utc: Callable[[], bool]) -> None:
         if said := await asyncio.to_thread(report_problem, folder, user):
             ui.notify(said, type="negative", timeout=10_000)
             return
-        ui.navigate.to(f"/report/{folder.name}", new_tab=True)
+        ui.navigate.to(f"/report/{folder.name}?hold={quote(hold)}", new_tab=True)
 
     async def review() -> None:
         folder = chosen()
@@ -139,9 +185,6 @@ def _command(*arguments: str) -> str:
         [sys.executable, "-m", "membrane_ctrl", *arguments], capture_output=True, text=True, check=False
     )
     return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["it failed"])[-1]
-
-
-_LOOK_S = 1.0
 
 
 def tuning_panel(logs: Path) -> None:

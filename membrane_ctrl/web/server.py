@@ -15,6 +15,7 @@ from membrane_ctrl.web.feed import HoldFeed
 from membrane_ctrl.web.page import WebPage
 from membrane_ctrl.web.panels import REPORT, run_folder
 
+_AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
 _REPORT_BYTES_MAX = 64_000_000
 
 
@@ -31,23 +32,25 @@ def accounts_of(page: WebConfig) -> Accounts:
     return Accounts(users, secure=page.secure)
 
 
-def serve(where: Where, page: WebConfig) -> None:
-    """Serve the page of a hold until interrupted. Raises InputError for a users file that is wrong."""
+def serve(holds: dict[str, Where], page: WebConfig) -> None:
+    """Serve the page of holds, by name, until interrupted. Raises InputError for a users file that is wrong."""
     accounts = accounts_of(page)
     hosts = frozenset({*LOCAL_HOSTS, page.host, *page.names})
-    feed = HoldFeed(where)
+    feeds = {name: HoldFeed(where) for name, where in holds.items()}
     app.add_middleware(LoginMiddleware, accounts=accounts, hosts=hosts)
-    app.on_startup(feed.open)
-    app.on_shutdown(feed.close)
+    for feed in feeds.values():
+        app.on_startup(feed.open)
+        app.on_shutdown(feed.close)
 
     @ui.page("/", title="membrane_ctrl")
-    def view(request: Request) -> None:
+    def view(request: Request, hold: str = "") -> None:
         user: WebUser = request.scope["membrane_user"]
-        WebPage([feed], where.logs, user).build()
+        WebPage(feeds, hold if hold in feeds else next(iter(feeds)), user).build()
 
     @app.get("/report/{name}")
-    def report(name: str) -> HTMLResponse:
-        return report_page(where.logs, name)
+    def report(name: str, hold: str = "") -> HTMLResponse:
+        logs = feeds[hold].logs if hold in feeds else None
+        return report_page(logs, name)
 
     scheme = "https" if page.secure else "http"
     link = f"{scheme}://{page.host}:{page.port}/" + ("" if accounts.users else f"?key={accounts.secret}")
@@ -60,14 +63,15 @@ def serve(where: Where, page: WebConfig) -> None:
         show=False,
         reload=False,
         show_welcome_message=False,
+        reconnect_timeout=_AWAY_S,
         ssl_certfile=page.certificate_file,
         ssl_keyfile=page.key_file,
     )
 
 
-def report_page(logs: Path, name: str) -> HTMLResponse:
+def report_page(logs: Path | None, name: str) -> HTMLResponse:
     """A run's report, in a sandbox: a run folder may come from anywhere."""
-    folder = run_folder(logs, name)
+    folder = None if logs is None else run_folder(logs, name)
     if folder is None:
         return HTMLResponse("no such run", 404)
     try:

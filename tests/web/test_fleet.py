@@ -1,0 +1,132 @@
+"""Several holds as one list: `ctl fleet` and the page's table, also when some are not there."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+import time
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.cli import run as command
+from membrane_ctrl.control_port.ctl import Where, fleet
+from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model.states import State
+from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.web.panels import fleet_rows
+from tests.control_port.port_run import port_run
+from tests.support.browser import browser_tab
+from tests.web.test_page import needs_browser, served, ticking
+
+
+def fleet_file(folder: Path, *names: str) -> Path:
+    file = folder / "fleet.toml"
+    file.write_text("".join(f'[[holds]]\nname = "{name}"\nsocket = "{name}/control.sock"\n' for name in names))
+    for name in names:
+        (folder / name).mkdir(exist_ok=True)
+    return file
+
+
+async def test_the_terminal_lists_all_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = fleet_file(tmp_path, "north", "south", "spare")
+    async with port_run(tmp_path / "north"), port_run(tmp_path / "south") as south:
+        south.state = State.FAULT
+        south.tick()
+        assert await asyncio.to_thread(command, ["ctl", "fleet", str(file)]) == Exit.DEVICE_FAILED
+        north, faulty, spare = capsys.readouterr().out.splitlines()
+        assert north.split()[:4] == ["north", "hold", "0.250", "um"]
+        assert faulty.split()[:2] == ["south", "fault"]
+        assert spare.startswith("spare  no contact")
+        assert "no hold is listening" in spare
+        assert "0.250" not in spare
+        assert await asyncio.to_thread(command, ["ctl", "fleet", str(file), "--json"]) == Exit.DEVICE_FAILED
+        found = json.loads(capsys.readouterr().out)
+        assert [found[name].get("state") for name in ("north", "south", "spare")] == ["hold", "fault", None]
+    assert await asyncio.to_thread(command, ["ctl", "fleet", str(fleet_file(tmp_path, "north"))]) == 4
+
+
+def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "fleet.toml").write_text(
+        '[[holds]]\nname = "here"\nsocket = "runs/control.sock"\n[[holds]]\nname = "far"\ntls = "bench2.lab:7470"\n'
+        'certificate_file = "me.pem"\nkey_file = "/etc/me.key"\nauthority_file = "lab.pem"\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    lab = tmp_path / "lab"
+    found = fleet(Path("lab/fleet.toml"))
+    assert found["here"] == Where(lab / "runs" / "control.sock", logs=lab / "runs")
+    far = found["far"]
+    assert (far.tls, far.certificate, far.key) == ("bench2.lab:7470", lab / "me.pem", Path("/etc/me.key"))
+    assert HoldFeed(far).logs is None, "its runs are on its host"
+    assert HoldFeed(found["here"]).logs == lab / "runs"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "holds"),
+        ("holds = []\n", "holds"),
+        ('[[holds]]\nname = "a"\n', "give either socket or tls"),
+        ('[[holds]]\nname = "a"\nsocket = "s"\ntls = "b:1"\n', "give either socket or tls"),
+        ('[[holds]]\nname = "a"\ntls = "b:1"\n', "tls needs certificate_file, key_file and authority_file"),
+        ('[[holds]]\nname = "a"\nsocket = "s"\n[[holds]]\nname = "a"\nsocket = "t"\n', "two have the same name"),
+        ('[[holds]]\nname = "<b>"\nsocket = "s"\n', "name"),
+    ],
+)
+def test_a_fleet_that_cannot_be_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "fleet.toml").write_text(text)
+    with pytest.raises(InputError, match=says):
+        fleet(tmp_path / "fleet.toml")
+
+
+def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
+    feeds = {name: HoldFeed(Where()) for name in ("good", "bad", "gone")}
+    now_s = time.monotonic()
+    status = {"state": "hold", "why": "", "row": {"error_um": 0.256}}
+    good = dataclasses.replace(feeds["good"].seen, problem="", seen_s=now_s, status=status)
+    feeds["good"].seen = good
+    feeds["bad"].seen = dataclasses.replace(good, status={**status, "maintenance": {"leak": "the leak grows"}})
+    feeds["gone"].seen = dataclasses.replace(good, seen_s=now_s - 100.0)
+    assert fleet_rows(feeds) == [
+        {"hold": "good", "state": "hold", "error": 0.26, "says": "as it should be"},
+        {"hold": "bad", "state": "hold", "error": 0.26, "says": "the leak grows"},
+        {"hold": "gone", "state": "no contact", "error": None, "says": "no status for 100 s"},
+    ]
+
+
+@needs_browser
+@pytest.mark.campaign
+@pytest.mark.real_time
+async def test_twenty_holds_on_one_page(tmp_path: Path) -> None:
+    names = [f"mirror{number}" for number in range(20)]
+    file = fleet_file(tmp_path, *names)
+    async with AsyncExitStack() as stack, AsyncExitStack() as last:
+        runs = [await stack.enter_async_context(port_run(tmp_path / name)) for name in names[:-1]]
+        runs.append(await last.enter_async_context(port_run(tmp_path / names[-1])))
+        tasks = [asyncio.create_task(ticking(run)) for run in runs]
+        try:
+            link = await stack.enter_async_context(served(tmp_path, "--fleet", str(file)))
+            tab = await stack.enter_async_context(browser_tab(link, tmp_path / "profile"))
+            rows = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
+            await tab.until(f"{rows}.filter(r => r.includes('hold') && r.includes('0.25')).length === 20")
+            await tab.screenshot(tmp_path / "fleet.png")
+            tasks[-1].cancel()
+            await last.aclose()
+            await tab.until(f"{rows}.filter(r => r.includes('no contact')).length === 1")
+            await tab.value("[...document.querySelectorAll('a')].find(a => a.innerText === 'mirror7').click()")
+            await tab.until(
+                "location.search === '?hold=mirror7' && document.body.innerText.includes('mirror7 the-run')"
+            )
+            await tab.value(
+                "[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause')).click()"
+            )
+            await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+            await tab.click("Do it")
+            await tab.until("document.body.innerText.includes('pause: done')")
+            assert [bool(run.asked) for run in runs] == [number == 7 for number in range(20)]
+        finally:
+            for task in tasks:
+                task.cancel()
