@@ -57,10 +57,8 @@ def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
     labels = {"hold": "mirror", "state": "state", "error": "error, um", "says": "alarms, or why"}
     columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in labels.items()]
     table = ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold").classes("w-full").props("dense")
-    table.add_slot(
-        "body-cell-hold",
-        '<q-td :props="props"><a class="underline" :href="\'/?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a></q-td>',
-    )
+    link = '<a class="underline" :href="\'/?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'
+    table.add_slot("body-cell-hold", f'<q-td :props="props">{link}</q-td>')
 
     def look() -> None:
         rows = fleet_rows(feeds)

@@ -22,7 +22,7 @@ from membrane_ctrl.model.states import State
 
 ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
 add_actions()
-ACTIONS = [command.name or "" for command in ctl_app.registered_commands]
+ACTIONS = [command.name or "" for command in ctl_app.registered_commands if command.name != "fleet"]  # asks several
 Asked = list[dict[str, Any]]
 
 
