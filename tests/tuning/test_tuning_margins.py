@@ -22,7 +22,7 @@ from tuning.proposal.candidates import (
     simc,
 )
 from tuning.proposal.design import designs, preview
-from tuning.proposal.prediction import least_std_um, predict
+from tuning.proposal.prediction import Walks, least_std_um, predict
 
 DT_S = 1e-3
 DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay
@@ -142,6 +142,18 @@ def test_the_bound_is_that_of_the_twin(feedforward: bool, agreement: float) -> N
     assert least_std_um(PUMP, typical(loop), loop, write_s=0.005) == pytest.approx(
         least_of_the_twin(loop, twin), rel=agreement
     )
+
+
+def test_weather_over_a_delay_of_many_of_its_lags_is_that_of_single_steps() -> None:
+    noise = Noise(0.1, 1e-3, 1e-4, 12.0, 0.01, ((0.01, 1e-6), (0.02, 1e-6), (5.0, 0.1)))
+    walks = Walks.of(DisturbanceModel(noise, None, None))
+    step, kicks = walks.over(0.01)
+    transition, covariance = np.eye(len(step)), np.zeros_like(kicks)
+    for _ in range(150):
+        transition, covariance = step @ transition, step @ covariance @ step.T + kicks
+    found = walks.over(1.5)
+    np.testing.assert_allclose(found[0], transition, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found[1], covariance, rtol=1e-6, atol=1e-15)
 
 
 def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> None:

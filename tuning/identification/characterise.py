@@ -11,6 +11,7 @@ from tuning.identification.identify import Identified, identify, independence, p
 from tuning.identification.records import Record
 
 MAP_THE_PUMP = "run `tune pump`"
+_FURTHER = "repeat `tune characterise` with a larger --limit-um"
 
 # Whether the data support a proposal; if not, the problem and the experiment that would help.
 
@@ -89,11 +90,11 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
         refused.append(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay")
     if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
-        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: repeat `tune characterise`")
+        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}")
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
         degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
     if sigma.delay_s > _DELAY_SIGMA_MAX_S:
-        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: repeat `tune characterise`")
+        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
         degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {MAP_THE_PUMP}")
@@ -251,20 +252,18 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
         if not finished.completed:
             done, stopped = None, relay if stopped is None else stopped.followed_by(relay)
-            if finished.reason.startswith(machine.NO_ANSWER) or _too_strong(stopped):
-                break
+            if finished.reason.startswith(machine.NO_ANSWER):
+                raise ExperimentError(f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}")
+            if _too_strong(stopped):
+                raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
             continue
         done, stopped = relay if done is None else done.followed_by(relay), None
         found = identify(done)
         if found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found):
             break
     if done is None:
-        said = finished.reason
-        if said.startswith(machine.NO_ANSWER):
-            said += f"; if that is not the cause, {MAP_THE_PUMP}"
-        elif said.startswith(machine.STOPPED):
-            said += f": {MAP_THE_PUMP}"
-        raise ExperimentError(said)
+        stopped_near = finished.reason.startswith(machine.STOPPED)
+        raise ExperimentError(finished.reason + (f": {_FURTHER}" if stopped_near else ""))
     return done, finished
 
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.trial import PumpStep
+from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM, PumpStep
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, PumpRun, fit, smoothed
 
@@ -278,9 +278,17 @@ class PumpSurvey:
         return self._net(level) * _PULSE_S <= 1.3 * self.limit_um
 
     def _run_s(self, level: Level) -> float:
-        fresh = level not in self.fit.levels
+        fresh, net = level not in self.fit.levels, self._net(level)
         way_um = self._travel_um * (0.6 if fresh else 1.0)
-        return min(max(way_um / max(abs(self._net(level)), 0.05), _PULSE_S), _LONGEST_S)
+        # a guess may be wrong, but a pump gives no less than at the largest smaller command that is known
+        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        least = float(flows[fractions <= level.fraction][-1])
+        if not fresh:
+            least = max(least, self.fit.levels[level].flow_um_per_s - 2 * self.fit.levels[level].sigma_um_per_s)
+        sinks_um_per_s = self.fit.leak_um_per_s - least
+        sunk_um = self._travel_um * (0.5 if net > 0 else 1.0)
+        longest_s = min(_LONGEST_S, sunk_um / max(sinks_um_per_s, 1e-3))
+        return max(min(way_um / max(abs(net), 0.05), longest_s), _PULSE_S)
 
     def _lasts_s(self, level: Level) -> float:
         leak = max(self.fit.leak_um_per_s, 0.05)
@@ -343,6 +351,14 @@ class PumpSurvey:
         _, flows, sigmas = (column[1:] for column in self._branches[True].columns)
         return bool((flows + 3 * sigmas < matters_um_per_s).all())
 
+    @property
+    def _further(self) -> str:
+        """What makes the flows known better: runs twice as long see twice the way."""
+        limit_um = min(2 * self.limit_um, LIMIT_MAX_UM)
+        if limit_um > self.limit_um:
+            return f"run `tune pump` again with --limit-um {limit_um:g}"
+        return "run `tune pump` again in steadier weather"
+
     def _known_part(self) -> tuple[Branch, bool]:
         """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
 
@@ -350,8 +366,7 @@ class PumpSurvey:
         """
         if not self.fit.levels:
             raise ValueError(
-                "the experiments were stopped too early: run `tune pump` again in steadier weather, or with a larger "
-                "--limit-um"
+                f"the experiments were stopped too early: {self._further}"
             )
         fractions, flows, sigmas = self._branches[True].columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
@@ -367,11 +382,12 @@ class PumpSurvey:
             low -= 1
         while top + 1 < known.size and known[top + 1]:
             top += 1
-        if top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak):
+        beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
+        if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
             raise ValueError(
-                f"the flow beyond a command of {fractions[top]:.2f} is not known to {_USEFUL_SHARE:.0%} after "
-                f"{self.duration_s / 60:.0f} minutes of experiments: run `tune pump` again with a larger --limit-um, "
-                "or in steadier weather"
+                f"the flow {'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f} is "
+                f"not known to {_USEFUL_SHARE:.0%} after {self.duration_s / 60:.0f} minutes of experiments: "
+                f"{self._further}"
             )
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0

@@ -113,11 +113,17 @@ class Walks:
         return cls(drift, diffusion, sums[0], sums[1], centre)
 
     def over(self, step_s: float) -> tuple[Matrix, Matrix]:
-        """Transition and noise covariance over a step (Van Loan 1978)."""
+        """Transition and noise covariance over a step (Van Loan 1978), doubled from one shorter than every lag."""
         n = len(self.drift)
-        block = expm(np.block([[-self.drift, self.diffusion], [np.zeros((n, n)), self.drift.T]]) * step_s)
+        doublings = max(0, math.ceil(math.log2(step_s * np.abs(self.drift).max())))
+        block = np.block([[-self.drift, self.diffusion], [np.zeros((n, n)), self.drift.T]])
+        block = expm(block * (step_s / 2**doublings))  # over many lags it would overflow
         transition = block[n:, n:].T
-        return transition, transition @ block[:n, n:]
+        covariance = transition @ block[:n, n:]
+        for _ in range(doublings):
+            covariance = covariance + transition @ covariance @ transition.T
+            transition = transition @ transition
+        return transition, covariance
 
 
 def loop_figures(

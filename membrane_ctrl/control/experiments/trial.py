@@ -24,6 +24,7 @@ class PumpStep(Section):
     until_um: Annotated[float, Field(ge=-30, le=30), _Short] | None = None  # from where the experiment began
 
 
+LIMIT_MAX_UM = 30.0
 ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
 
 
@@ -37,7 +38,7 @@ class ExperimentSpec(Section):
     version: Literal[1] = 1
     kind: ExperimentKind
     duration_s: Annotated[float, Field(ge=5, le=1800)] = 120.0  # the pump map ends when it is done
-    limit_um: Annotated[float, Field(ge=3, le=30)] = 10.0  # furthest from the setpoint
+    limit_um: Annotated[float, Field(ge=3, le=LIMIT_MAX_UM)] = 10.0  # furthest from the setpoint
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far

@@ -1,0 +1,121 @@
+"""Who does what a refusal of `tune` says gets what was asked for; benches of the second world, defaults, 10 Hz."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.model.errors import Exit
+from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tuning import opening
+from tuning.opening import TwinHold
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A bench, what is wrong with it, what is asked of it, what is said, and what is then done."""
+
+    words: tuple[str, ...]  # of the command
+    said: str
+    instead: tuple[str, ...] = ()  # the words that the refusal asks for; else the same
+    plant: Callable[[], ForeignPlant] = lambda: ForeignPlant(ForeignPump(), weather=0.3, laser_um=0.5)
+    wrong: dict[str, float] = field(default_factory=dict)  # until the refusal is obeyed
+    then: Callable[[], ForeignPlant] | None = None  # another bench than before
+    bleed_fraction: float = 0.0  # from then on
+    code: Exit = Exit.REJECTED
+
+
+def straight(**plant: float) -> Callable[[], ForeignPlant]:
+    return lambda: ForeignPlant(ForeignPump(), **{"weather": 0.3, "laser_um": 0.5, **plant})  # type: ignore[arg-type]
+
+
+REFUSALS = {
+    "limit in the noise": Refusal(
+        ("characterise", "--limit-um", "3"),
+        "give a larger limit",
+        ("characterise", "--limit-um", "20"),
+        straight(laser_um=3.0),
+        code=Exit.DEVICE_FAILED,
+    ),
+    "observed too briefly": Refusal(
+        ("run", "--yes", "--observe", "60s"), "200 s at least", ("run", "--yes", "--observe", "200s", "--verify", "60s")
+    ),
+    "stuck pump": Refusal(
+        ("pump",), "the pump is stuck, or its gas does not arrive: free it", wrong={"pump_stuck_fraction": 0.31}
+    ),
+    "laser lost": Refusal(
+        ("characterise",), "no valid laser reading; start or resume", wrong={"no_light": 1}, code=Exit.DEVICE_FAILED
+    ),
+    "too tight": Refusal(
+        ("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1), bleed_fraction=0.005
+    ),
+    "flows not known": Refusal(
+        ("pump",),
+        "run `tune pump` again with --limit-um 20",
+        ("pump", "--limit-um", "20"),
+        lambda: ForeignPlant(ForeignPump("s-shaped", 5.6, 1.33, 0.65), 1032, 0.47, 2.41, True, 1.0),
+    ),
+    "relays stopped by noise": Refusal(
+        ("characterise",),
+        "repeat `tune characterise` with a larger --limit-um",
+        ("characterise", "--limit-um", "20"),
+        straight(seed=3, weather=2.0, laser_um=3.0),
+    ),
+    "survey stopped by weather": Refusal(
+        ("pump", "--limit-um", "30"),
+        "run `tune pump` again in steadier weather",
+        plant=straight(seed=3, weather=4.0, gusts=True, laser_um=3.0),
+        then=straight(seed=3, weather=1.0, laser_um=3.0),
+    ),
+}
+
+
+class Hold(TwinHold):
+    """What `--twin` starts: a hold on the plant of the refusal."""
+
+    refusal: Refusal
+    obeyed = False
+
+    def __init__(self, config: Config) -> None:
+        plant = self.refusal.then if self.obeyed and self.refusal.then else self.refusal.plant
+        super().__init__(config, bench=foreign_bench(plant()))
+        for _ in range(0 if self.obeyed else 40):
+            self.news()
+        for name, value in ({} if self.obeyed else self.refusal.wrong).items():
+            setattr(self.bench.wrong, name, value)
+
+
+def obeyed(refusal: Refusal, logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Ask, be refused, do what the refusal says, and get it."""
+    monkeypatch.setattr(opening, "TwinHold", Hold)
+    monkeypatch.setattr(Hold, "refusal", refusal, raising=False)
+    loop = {"rate_hz": 10.0}
+    config = logs / "lab.toml"
+
+    def tuned(words: tuple[str, ...]) -> tuple[int, str]:
+        config.write_text(dump(foreign_config(**loop)))
+        code = run(["tune", *words, "--twin", "--config", str(config), "--logs", str(logs)])
+        return code, capsys.readouterr().err
+
+    code, said = tuned(refusal.words)
+    assert code == refusal.code, said
+    assert refusal.said in said
+    assert "Traceback" not in said
+    monkeypatch.setattr(Hold, "obeyed", True)
+    loop["bleed_fraction"] = refusal.bleed_fraction
+    code, said = tuned(refusal.instead or refusal.words)
+    assert code == Exit.DONE, said
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_refusal_that_is_obeyed_is_not_given_again(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    obeyed(REFUSALS[name], tmp_path, monkeypatch, capsys)
