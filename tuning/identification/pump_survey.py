@@ -357,7 +357,7 @@ class PumpSurvey:
         limit_um = min(2 * self.limit_um, LIMIT_MAX_UM)
         if limit_um > self.limit_um:
             return f"run `tune pump` again with --limit-um {limit_um:g}"
-        return "run `tune pump` again in steadier weather"
+        return "run `tune pump` again in steadier weather, or with a quieter laser"
 
     def _known_part(self) -> tuple[Branch, bool]:
         """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
@@ -365,9 +365,7 @@ class PumpSurvey:
         Beyond them nothing is said. Raises ValueError if there are none.
         """
         if not self.fit.levels:
-            raise ValueError(
-                f"the experiments were stopped too early: {self._further}"
-            )
+            raise ValueError(f"the experiments were stopped too early: {self._further}")
         fractions, flows, sigmas = self._branches[True].columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if self._stuck():
