@@ -279,15 +279,13 @@ class PumpSurvey:
 
     def _run_s(self, level: Level) -> float:
         fresh, net = level not in self.fit.levels, self._net(level)
-        way_um = self._travel_um * (0.6 if fresh else 1.0)
-        # a guess may be wrong, but a pump gives no less than at the largest smaller command that is known
-        fractions, flows = (np.append(0.0, column) for column in self._sure())
-        least = float(flows[fractions <= level.fraction][-1])
-        if not fresh:
-            least = max(least, self.fit.levels[level].flow_um_per_s - 2 * self.fit.levels[level].sigma_um_per_s)
-        sinks_um_per_s = self.fit.leak_um_per_s - least
-        sunk_um = self._travel_um * (0.5 if net > 0 else 1.0)
-        longest_s = min(_LONGEST_S, sunk_um / max(sinks_um_per_s, 1e-3))
+        longest_s, way_um = _LONGEST_S, self._travel_um
+        if fresh:
+            # the guess may be wrong, but a pump gives no less than at the largest smaller command that is known
+            fractions, flows = (np.append(0.0, column) for column in self._sure())
+            sinks_um_per_s = self.fit.leak_um_per_s - float(flows[fractions <= level.fraction][-1])
+            longest_s = min(longest_s, way_um * (0.5 if net > 0 else 1.5) / max(sinks_um_per_s, 1e-3))
+            way_um *= 0.6
         return max(min(way_um / max(abs(net), 0.05), longest_s), _PULSE_S)
 
     def _lasts_s(self, level: Level) -> float:
