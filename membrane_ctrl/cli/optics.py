@@ -9,9 +9,10 @@ from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetA
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `track`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
+    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
     app.command()(measure)
     app.command()(track)
+    app.command()(modes)
     app.command()(export_figure)
     app.command()(film)
     app.command()(uncertainty)
@@ -50,6 +51,20 @@ def track(
     from membrane_ctrl.measure.track import TrackOptions, track_command
 
     return track_command(TrackOptions(capture_set, geometry, out, json, pictures))
+
+
+def modes(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="SET...|RUN...", help="Tracked sets, or runs that tracked.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output folder; modes, in the last one, by default.")] = None,
+    pictures: Annotated[bool, typer.Option(help="Draw modes.png and write modes.rrd next to the result.")] = True,
+    json: JsonOption = False,
+) -> int:
+    """Find the mirror's vibrations in tracked figures: frequency, amplitude and shape; whether one moves."""
+    from membrane_ctrl.review.statistics.modes_run import ModesOptions, modes_command
+
+    return modes_command(ModesOptions(tuple(folders), out, json, pictures))
 
 
 def export_figure(

@@ -182,6 +182,8 @@ def _noise(power: FloatArray, alias_hz: FloatArray) -> FloatArray:
 def _threshold(seen: FloatArray, frequencies: int) -> float:
     """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of these quantiles."""
     low, middle = np.quantile(seen, [0.1, 0.5])  # of the lower half, where neither lines nor their aliases are
+    if not middle > low:
+        return float("inf")  # nothing moves at all
     order = max((1.2816 * middle / (middle - low)) ** 2, 1.0)
     return float(middle / stats.gamma.median(order) * stats.gamma.isf(_CHANCE / frequencies, order))
 

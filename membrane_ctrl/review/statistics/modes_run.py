@@ -1,0 +1,245 @@
+"""`modes`: the mirror's vibrations in tracked figures, minute by minute, and whether one of them moves."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
+from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.track.modes import LEAST_S, VibrationMode, find_modes
+from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.run_files.run_folder import is_run
+
+_SEARCH_S = 60.0
+_SEARCHES = 60  # of a run, evenly spread: a quarter of a second each
+_LEAST_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
+_SAME = 0.004  # relative: two searches see one mode
+_SHOWN = 6  # modes in the picture
+_USUAL = 0.5  # share of the searches that a mode is in
+_FRAMES_MOST = 300_000  # of a set: four hours at 20 Hz
+_MOVED = 0.01  # relative: the film's tension has changed by 2 %
+
+
+@dataclass(frozen=True)
+class ModesOptions:
+    """Options of the command."""
+
+    folders: tuple[Path, ...]
+    out: Path | None = None
+    as_json: bool = False
+    pictures: bool = True
+
+
+@dataclass(frozen=True)
+class SeenMode:
+    """A vibration in the searches that found it."""
+
+    time_s: FloatArray  # (n,): UTC, or the set's own seconds
+    lines: tuple[VibrationMode, ...]
+
+    @property
+    def frequency_hz(self) -> float:
+        """Mean, weighted by the searches' own errors."""
+        return float(np.average([line.frequency_hz for line in self.lines], weights=self._weights()))
+
+    @property
+    def sigma_hz(self) -> float:
+        """Standard error of the mean, from the searches' errors or from their scatter if that is larger."""
+        own = 1 / np.sqrt(np.sum(self._weights()))
+        values = [line.frequency_hz for line in self.lines]
+        return float(max(own, np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0))
+
+    @property
+    def shape(self) -> FloatArray:
+        """Terms (36,) of unit RMS: the mean of the searches', their signs aligned."""
+        together = np.array([line.shape for line in self.lines])
+        return np.asarray(np.linalg.svd(together, full_matrices=False)[2][0])
+
+    @property
+    def moved(self) -> float:
+        """Relative change from the first third of the searches to the last; 0 with fewer than six."""
+        values = np.array([line.frequency_hz for line in self.lines])[np.argsort(self.time_s)]
+        third = len(values) // 3
+        return float(np.median(values[-third:]) / np.median(values[:third]) - 1) if third > 1 else 0.0
+
+    def _weights(self) -> FloatArray:
+        return np.array([line.sigma_hz for line in self.lines]) ** -2.0
+
+
+def modes_command(options: ModesOptions) -> int:
+    """Search the frames for vibrations, write `modes.json` and pictures, report. Raises CommandError."""
+    times: list[float] = []
+    searches: list[tuple[VibrationMode, ...] | None] = []
+    for folder in options.folders:
+        time_s, coeffs_um, origin_s = _frames(folder)
+        for part in terminal.counted(_minutes(time_s), "searches"):
+            times.append(origin_s + float(time_s[part].mean()))
+            searches.append(_found(folder, time_s[part], coeffs_um[part]))
+    done = [(at_s, lines) for at_s, lines in zip(times, searches, strict=True) if lines is not None]
+    if not done:
+        raise errors.RejectedError(f"{options.folders[0]}: less than {LEAST_S:g} s of frames at a steady rate")
+    modes, passing = _together(np.array([at_s for at_s, _ in done]), [lines for _, lines in done])
+    table = _table(options.folders, modes, passing, len(done))
+    out = (options.out or options.folders[-1] / "modes").resolve()
+    with errors.writing(out):
+        files.make_folder(out)
+        write_json(out / "modes.json", table)
+        if options.pictures and modes:
+            _show(out, modes, min(times), _lines(table))
+    print(f"written to {out}", file=sys.stderr)
+    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    return 0
+
+
+def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
+    """Times, terms (n, 36) with NaN where rejected, and the UTC of time 0. Raises CommandError."""
+    if is_run(folder):
+        run = open_run(folder)
+        shapes, origin_s = run.shapes(), run.origin_utc.timestamp()
+        time_s, coeffs_um, verdict = shapes.time_s, shapes.coeffs_um, shapes.verdict
+    else:
+        path = next((p for p in (folder / "track.npz", folder / "result" / "track.npz") if p.exists()), None)
+        if path is None:
+            raise errors.InputError(f"{folder}: neither a run nor the result of `membrane-ctrl track`")
+        try:
+            time_s, coeffs_um = read_arrays(path, ("time_s", "coeffs_um"), _FRAMES_MOST * zernike.TERMS)
+        except (OSError, ValueError) as error:
+            raise errors.InputError(f"{path}: {error}") from None
+        if coeffs_um.shape != (time_s.size, zernike.TERMS):
+            raise errors.InputError(f"{path}: coeffs_um: not {zernike.TERMS} terms for each time_s")
+        origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
+    good = np.isfinite(time_s) & (verdict != "rejected")
+    order = np.argsort(time_s[good], kind="stable")
+    time_s, coeffs_um = np.asarray(time_s[good][order], float), np.asarray(coeffs_um[good][order], float)
+    interval_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.inf
+    if not interval_s * _LEAST_HZ <= 1:
+        raise errors.RejectedError(
+            f"{folder}: a figure every {interval_s:.1f} s shows no vibrations; hold with shape.mode = track"
+        )
+    return time_s, coeffs_um, origin_s
+
+
+def _minutes(time_s: FloatArray) -> list[slice]:
+    """Minutes of frames, evenly spread if there are many."""
+    count = max(1, round((time_s[-1] - time_s[0]) / _SEARCH_S))
+    edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1] + 1e-6, count + 1))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _SEARCHES)).round().astype(int))
+    return [slice(edges[k], edges[k + 1]) for k in chosen]
+
+
+def _found(folder: Path, time_s: FloatArray, coeffs_um: FloatArray) -> tuple[VibrationMode, ...] | None:
+    """What a search finds; None if its frames have too many gaps."""
+    try:
+        return find_modes(time_s, coeffs_um)
+    except ValueError:
+        return None
+
+
+def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]) -> tuple[list[SeenMode], int]:
+    """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how many others."""
+    seen = sorted(
+        ((line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines),
+        key=lambda each: each[0].frequency_hz,
+    )
+    groups: list[list[tuple[VibrationMode, float]]] = []
+    for line, at_s in seen:
+        if groups and line.frequency_hz < groups[-1][-1][0].frequency_hz * (1 + _SAME):
+            groups[-1].append((line, at_s))
+        else:
+            groups.append([(line, at_s)])
+    least = max(1, round(_USUAL * len(searches)))
+    usual = [group for group in groups if len({at_s for _, at_s in group}) >= least]
+    modes = [SeenMode(np.array([at for _, at in group]), tuple(line for line, _ in group)) for group in usual]
+    modes.sort(key=lambda mode: -sum(line.evidence for line in mode.lines))
+    return modes, sum(len(group) for group in groups) - sum(len(group) for group in usual)
+
+
+def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:
+    return {
+        "schema": "membrane-modes/1",
+        "sources": [folder.name for folder in folders],
+        "searches": searches,
+        "modes": [
+            {
+                "frequency_hz": mode.frequency_hz,
+                "sigma_hz": mode.sigma_hz,
+                "amplitude_nm": float(np.median([line.amplitude_nm for line in mode.lines])),
+                "searches": len(mode.lines),
+                "aliases_hz": list(mode.lines[0].aliases_hz) if all(line.aliases_hz for line in mode.lines) else [],
+                "moved": mode.moved,
+                "shape": mode.shape.tolist(),
+            }
+            for mode in modes
+        ],
+        "passing": passing,
+    }
+
+
+def _lines(table: dict[str, Any]) -> list[str]:
+    lines = [f"searches   {table['searches']} of a minute at most"]
+    for mode in table["modes"]:
+        terms = np.argsort(np.abs(mode["shape"]))[::-1][:3]
+        made = ", ".join(f"{mode['shape'][j]:+.2f} Z{j + 1}" for j in terms)
+        line = (
+            f"mode       {mode['frequency_hz']:.3f} +- {mode['sigma_hz']:.3f} Hz, {mode['amplitude_nm']:.1f} nm, in "
+            f"{mode['searches']} searches; {made}"
+        )
+        if mode["aliases_hz"]:
+            others = ", ".join(f"{alias:.2f}" for alias in mode["aliases_hz"])
+            line += f"; or {others} Hz: the frames have one rate"
+        lines.append(line)
+        if abs(mode["moved"]) > _MOVED:
+            lines.append(
+                f"           it moved by {mode['moved']:+.1%}: the film's tension by {2 * mode['moved']:+.1%}; check "
+                "clamping and pressure"
+            )
+    if not table["modes"]:
+        lines.append("mode       none that stands out of the noise")
+    if table["passing"]:
+        lines.append(f"passing    {table['passing']} lines in fewer than half of the searches")
+    return lines
+
+
+def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[str]) -> None:
+    """Write `modes.png` and `modes.rrd`. Raises OSError."""
+    import rerun as rr
+
+    from membrane_ctrl.measure.pictures import log_pictures, result_recording
+
+    picture = _draw(out / "modes.png", modes, begin_s)
+    with result_recording(out / "modes.rrd", "membrane_ctrl_modes") as recording:
+        recording.log("modes/report", rr.TextDocument("\n".join(lines)), static=True)
+        for k, mode in enumerate(modes, start=1):
+            at = [rr.TimeColumn("run_time", duration=mode.time_s - begin_s)]
+            for name in ("frequency_hz", "amplitude_nm"):
+                values = [getattr(line, name) for line in mode.lines]
+                recording.send_columns(f"modes/{k}/{name}", at, rr.Scalars.columns(scalars=values))
+        log_pictures(recording, "modes/pictures", [picture])
+
+
+def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
+    """Draw the frequencies over time and the shapes of the strongest modes."""
+    from membrane_ctrl.measure.pictures import sheet
+
+    shown = modes[:_SHOWN]
+    figure, axes = sheet(11, 3 * len(shown), len(shown), 2)
+    side = np.linspace(-1, 1, 121)
+    x, y = np.meshgrid(side, side)
+    for mode, (over_time, shape) in zip(shown, np.reshape(axes, (-1, 2)), strict=True):
+        minutes = (mode.time_s - begin_s) / 60
+        over_time.errorbar(
+            minutes, [line.frequency_hz for line in mode.lines], [line.sigma_hz for line in mode.lines], fmt="."
+        )
+        over_time.set(xlabel="time (min)", ylabel="frequency (Hz)")
+        height = np.where(np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.values(x, y), 1), np.nan)
+        most = float(np.nanmax(np.abs(height)))
+        shape.imshow(height, cmap="RdBu_r", vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1))
+        shape.set(title=f"shape at {mode.frequency_hz:.2f} Hz", xticks=[], yticks=[])
+    return write_figure(path, figure)
