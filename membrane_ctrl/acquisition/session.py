@@ -2,6 +2,7 @@
 
 import signal
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -187,7 +188,7 @@ def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
 
 def _reconstructor(
     spec: process.AcquisitionSpec, optics: OpticsConfig, plan: cycle.CyclePlan
-) -> tuple[cycle.Reconstructor, cycle.CyclePlan, float]:
+) -> tuple[cycle.Reconstructor, cycle.CyclePlan, Callable[[], float]]:
     """What makes figures of the frames, the patterns it needs, and the interval between its figures.
 
     The figures have their covariance if the uncertainty of the geometry is stated.
@@ -197,10 +198,10 @@ def _reconstructor(
     spread, _ = spread_file.spread_of(optics, kept if kept is not None and kept.exists() else None)
     cycles = live.LiveReconstructor(optics, shape.bin_px, spread=spread)
     if shape.mode == "cycle":
-        return cycles, plan, shape.period_s
+        return cycles, plan, lambda: shape.period_s
     exposure_s = optical_bench.exposure_s(spec.config) if spec.truth is None else 0.0
     tracker = LiveTracker(optics, cycles, shape.track_periods, shape.track_step_s, exposure_s)
-    return tracker, replace(plan, standing=lambda: tracker.pattern), 1 / shape.track_rate_hz
+    return tracker, replace(plan, standing=lambda: tracker.pattern), lambda: tracker.slower / shape.track_rate_hz
 
 
 def _twin_bench(

@@ -20,12 +20,12 @@ def keep_cycling(
     remote: process.Remote,
     publish: Callable[[shape_estimate.ShapeEstimate], None],
     clock: exposures.CycleClock,
-    period_s: float,
+    period_s: Callable[[], float],
     keep: Callable[[shape_estimate.ShapeEstimate], Path],
 ) -> None:
     """Take cycles until stopped.
 
-    A cycle must end early when `remote.interrupts()`; one longer than `period_s` skips the deadlines it covers.
+    A cycle must end early when `remote.interrupts()`; one longer than `period_s()` skips the deadlines it covers.
     `publish` gets every estimate, whatever its verdict. `keep` writes the frames of a cycle and returns the set's
     folder, or raises OSError with the reason.
     """
@@ -49,7 +49,7 @@ def keep_cycling(
         if captures:
             remote.tell(_captured(result, keep))
         pause_s = result.pause_s if result is not None else 0.0
-        due_s = next_deadline_s(due_s, period_s, clock.now() + pause_s)
+        due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
 
 
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:

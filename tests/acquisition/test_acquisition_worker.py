@@ -73,7 +73,7 @@ class Loop:
         self.disk_full = False
 
     def run(self) -> None:
-        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, 2.0, self.keep)  # type: ignore[arg-type]
+        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, lambda: 2.0, self.keep)  # type: ignore[arg-type]
 
     def keep(self, estimate: ShapeEstimate) -> Path:
         if self.disk_full:

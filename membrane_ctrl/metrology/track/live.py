@@ -24,6 +24,9 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 LOST_S = 1.0
 # A hand or a lamp goes away by itself, and meanwhile a full cycle would be rejected too.
 REJECTED_S = 10.0
+# The interval between frames is longer in two of three steps: vibrations faster than half the frame rate then have
+# different aliases (`modes`).
+_SLOWER = (1.0, 1.09, 1.17)
 _UM, _SHARE, _TIME_S = 3, 4, 6  # decimals: a nanometre, a hundredth of a per cent, a microsecond
 
 
@@ -64,6 +67,11 @@ class LiveTracker:
     def pattern(self) -> Pattern:
         """What the next crossed frame must show."""
         return self.patterns[self._step % ENOUGH_STEPS]
+
+    @property
+    def slower(self) -> float:
+        """How much longer than usual the interval to the next frame is."""
+        return _SLOWER[self._step % len(_SLOWER)]
 
     def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
         """The figure of a full cycle, which anchors the frames after it. As `LiveReconstructor.full`."""
