@@ -154,7 +154,7 @@ def _evidence(spectra: list[ComplexArray], pieces: list[_Piece]) -> FloatArray:
         axis=1,
     )
     power = np.sum(np.abs(white) ** 2, axis=2)
-    quiet = white[power < np.median(power, axis=0)]  # lines, and their aliases, are in the other half
+    quiet = white[power <= np.median(power, axis=0)]  # lines, and their aliases, are in the other half
     values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
     kept = values > 1e-3 * values[-1]
     alone = (white @ vectors[:, kept]) / np.sqrt(values[kept])

@@ -20,7 +20,8 @@ from membrane_ctrl.run_files.run_folder import is_run
 _SEARCH_S = 60.0
 _SEARCHES = 60  # of a run, evenly spread: a quarter of a second each
 _LEAST_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
-_SAME = 0.004  # relative: two searches see one mode
+_SAME = 0.004  # relative: two searches see one mode, whatever the shapes
+_FAR, _ALIKE = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
 _SHOWN = 6  # modes in the picture
 _USUAL = 0.5  # share of the searches that a mode is in
 _FRAMES_MOST = 300_000  # of a set: four hours at 20 Hz
@@ -121,7 +122,8 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     interval_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.inf
     if not interval_s * _LEAST_HZ <= 1:
         raise errors.RejectedError(
-            f"{folder}: a figure every {interval_s:.1f} s shows no vibrations; hold with shape.mode = track"
+            f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; {_LEAST_HZ:g} a second are needed: "
+            'hold with shape.mode = "track"'
         )
     return time_s, coeffs_um, origin_s
 
@@ -144,21 +146,29 @@ def _found(folder: Path, time_s: FloatArray, coeffs_um: FloatArray) -> tuple[Vib
 
 def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]) -> tuple[list[SeenMode], int]:
     """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how many others."""
-    seen = sorted(
-        ((line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines),
-        key=lambda each: each[0].frequency_hz,
-    )
-    groups: list[list[tuple[VibrationMode, float]]] = []
-    for line, at_s in seen:
-        if groups and line.frequency_hz < groups[-1][-1][0].frequency_hz * (1 + _SAME):
-            groups[-1].append((line, at_s))
+    modes: list[SeenMode] = []
+    seen = [(line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines]
+    for line, at_s in sorted(seen, key=lambda each: each[0].frequency_hz):
+        near = (k for k, mode in enumerate(modes) if _is_one(mode, line, at_s))
+        if (k := next(near, None)) is None:
+            modes.append(SeenMode(np.array([at_s]), (line,)))
         else:
-            groups.append([(line, at_s)])
+            modes[k] = SeenMode(np.append(modes[k].time_s, at_s), (*modes[k].lines, line))
     least = max(1, round(_USUAL * len(searches)))
-    usual = [group for group in groups if len({at_s for _, at_s in group}) >= least]
-    modes = [SeenMode(np.array([at for _, at in group]), tuple(line for line, _ in group)) for group in usual]
-    modes.sort(key=lambda mode: -sum(line.evidence for line in mode.lines))
-    return modes, sum(len(group) for group in groups) - sum(len(group) for group in usual)
+    usual = sorted(
+        (mode for mode in modes if len(mode.lines) >= least),
+        key=lambda mode: -sum(one.evidence for one in mode.lines),
+    )
+    return usual, len(seen) - sum(len(mode.lines) for mode in usual)
+
+
+def _is_one(mode: SeenMode, line: VibrationMode, at_s: float) -> bool:
+    """Whether a line is that mode in another search: nearly its frequency, or its shape somewhat beside it."""
+    last = mode.lines[-1]
+    change = line.frequency_hz / last.frequency_hz - 1
+    return at_s not in mode.time_s.tolist() and bool(
+        change < _SAME or (change < _FAR and abs(line.shape @ last.shape) > _ALIKE)
+    )
 
 
 def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:

@@ -1,0 +1,67 @@
+"""A mirror that vibrates, simulated at 2 kHz, and a camera whose rate changes every ten seconds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from membrane_ctrl.metrology.track.modes import VibrationMode
+
+FloatArray = NDArray[np.float64]
+THREE_RATES = (20.0, 18.4, 17.1)
+
+
+@dataclass(frozen=True)
+class Planted:
+    """A mode: frequency and shape of unit RMS."""
+
+    frequency_hz: float
+    shape: FloatArray
+
+    def seen_by(self, found: tuple[VibrationMode, ...]) -> list[VibrationMode]:
+        return [mode for mode in found if abs(mode.frequency_hz - self.frequency_hz) < 0.1]
+
+
+def frame_times_s(rates_hz: tuple[float, ...], seconds: float) -> FloatArray:
+    """Mid-exposures; the rate changes every ten seconds."""
+    out: list[FloatArray] = []
+    now = 100.0
+    while now < 100.0 + seconds:
+        rate_hz = rates_hz[len(out) % len(rates_hz)]
+        out.append(now + np.arange(round(10 * rate_hz)) / rate_hz)
+        now = out[-1][-1] + 1 / rate_hz
+    return np.concatenate(out)
+
+
+def watched(
+    seed: int,
+    lines_hz: tuple[float, ...] = (27.0, 48.0, 57.0, 61.0),
+    rates_hz: tuple[float, ...] = THREE_RATES,
+    seconds: float = 60.0,
+    noise_nm: float = 12.0,
+    quality: float = math.inf,
+) -> tuple[FloatArray, FloatArray, list[Planted]]:
+    """Times, terms in um and what was planted: 5 nm each, in noise that terms share, on terms that drift."""
+    rng = np.random.default_rng(seed)
+    t = frame_times_s(rates_hz, seconds)
+    mixed = np.linalg.qr(rng.normal(size=(36, 36)))[0]
+    terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed + np.cumsum(rng.normal(size=(t.size, 36)), axis=0)
+    planted = []
+    for line_hz in lines_hz:
+        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), rng.normal(size=36)
+        shape /= np.linalg.norm(shape)
+        planted.append(Planted(frequency_hz, shape))
+        if math.isinf(quality):
+            wave = np.cos(2 * math.pi * frequency_hz * t + rng.uniform(0, 6))
+        else:
+            step_s = 1 / 2000
+            pole = np.exp((2j - 1 / quality) * math.pi * frequency_hz * step_s)
+            pushed = rng.normal(size=(round((t[-1] - t[0]) / step_s) + 2, 2)) @ [1, 1j]
+            ringing = lfilter([1], [1, -pole], pushed).real
+            wave = np.interp(t - t[0], np.arange(ringing.size) * step_s, ringing / ringing.std() * math.sqrt(0.5))
+        terms_nm += 5.0 * np.outer(wave, shape)
+    return t, terms_nm * 1e-3, planted
