@@ -153,8 +153,8 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 
 # Who else writes, and why it is no stranger's folder.
 _OWN = {
-    # the recorder and the start of a hold, in the folder that the run has just made
-    "hold/start.py",
+    # the recorder, and the log of a program beside a hold, in the folder that the run has just made
+    "processes/child.py",
     "run_files/sealed_stream.py", "run_files/events.py", "recorder/recorder.py",
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
