@@ -24,6 +24,7 @@ _SAME = 0.004  # relative: two searches see one mode, whatever the shapes
 _FAR, _ALIKE = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
 _SHOWN = 6  # modes in the picture
 _USUAL = 0.5  # share of the searches that a mode is in
+_LARGEST_UM = 1e6  # a term of a metre is none
 _FRAMES_MOST = 300_000  # of a set: four hours at 20 Hz
 _MOVED = 0.01  # relative: the film's tension has changed by 2 %
 
@@ -116,10 +117,12 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
         if coeffs_um.shape != (time_s.size, zernike.TERMS):
             raise errors.InputError(f"{path}: coeffs_um: not {zernike.TERMS} terms for each time_s")
         origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
-    good = np.isfinite(time_s) & (verdict != "rejected")
+    good = np.isfinite(time_s) & (verdict != "rejected") & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
     order = np.argsort(time_s[good], kind="stable")
     time_s, coeffs_um = np.asarray(time_s[good][order], float), np.asarray(coeffs_um[good][order], float)
-    interval_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.inf
+    if time_s.size < 2:
+        raise errors.RejectedError(f"{folder}: no usable figures")
+    interval_s = float(np.median(np.diff(time_s)))
     if not interval_s * _LEAST_HZ <= 1:
         raise errors.RejectedError(
             f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; {_LEAST_HZ:g} a second are needed: "
@@ -130,9 +133,9 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
 
 def _minutes(time_s: FloatArray) -> list[slice]:
     """Minutes of frames, evenly spread if there are many."""
-    count = max(1, round((time_s[-1] - time_s[0]) / _SEARCH_S))
-    edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1] + 1e-6, count + 1))
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _SEARCHES)).round().astype(int))
+    _, first = np.unique(np.floor((time_s - time_s[0]) / _SEARCH_S), return_index=True)
+    edges = [*first, time_s.size]
+    chosen = np.unique(np.linspace(0, len(first) - 1, min(len(first), _SEARCHES)).round().astype(int))
     return [slice(edges[k], edges[k + 1]) for k in chosen]
 
 
