@@ -61,12 +61,18 @@ class DrawnBench:
     gusts: bool
 
     def plant(self, weather_seed: int) -> second_world.ForeignPlant:
-        """The bench, in weather of its own."""
+        """The bench, in weather that no other bench has: what one hour shares is no proof."""
         pump = second_world.ForeignPump(
             self.shape, self.full_um_per_s, self.delay_s, self.lag_s, self.start, self.stall, self.play
         )
         return second_world.ForeignPlant(
-            pump, weather_seed, self.weather, self.leak_um_per_s, self.gusts, self.laser_um, self.barometer
+            pump,
+            10 * self.seed + weather_seed,
+            self.weather,
+            self.leak_um_per_s,
+            self.gusts,
+            self.laser_um,
+            self.barometer,
         )
 
     def config(self) -> Config:
