@@ -121,7 +121,7 @@ def export_run(
 @runs_app.callback()
 def list_runs(
     context: typer.Context,
-    logs: LogsOption = Path("logs"),
+    logs: Annotated[list[Path] | None, typer.Option("--logs", help="Folder of the runs; repeatable.")] = None,
     since: Annotated[str | None, typer.Option(help="Only runs started on this day (UTC) or later.")] = None,
     until: Annotated[str | None, typer.Option(help="Only runs started before this day (UTC).")] = None,
     longer: Annotated[str | None, typer.Option(help="Only runs at least this long, e.g. 2h.")] = None,
@@ -133,7 +133,7 @@ def list_runs(
     name: Annotated[str | None, typer.Option(help="Part of the run's name.")] = None,
     json: JsonOption = False,
 ) -> int:
-    """List the runs, oldest first."""
+    """List the runs of one folder or more, oldest first."""
     from membrane_ctrl.model import clock
     from membrane_ctrl.review.catalogue import Filter
     from membrane_ctrl.review.runs import list_command
@@ -149,7 +149,7 @@ def list_runs(
     wanted = Filter(
         least_s=least_s, most_std_um=std_um, with_faults=faults, configuration=configuration, text=name
     )  # fmt: skip
-    return list_command(logs, wanted, since, until, json)
+    return list_command(logs or [Path("logs")], wanted, since, until, json)
 
 
 @runs_app.command("show")

@@ -19,14 +19,18 @@ from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import add_mark
 
 
-def list_command(logs: Path, wanted: catalogue.Filter, since: str | None, until: str | None, json: bool) -> int:
-    """Print the table of runs that pass a filter."""
+def list_command(
+    logs: Sequence[Path], wanted: catalogue.Filter, since: str | None, until: str | None, json: bool
+) -> int:
+    """Print the table of the folders' runs that pass a filter, oldest first."""
     wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
-    found = catalogue.entries(logs, wanted)
+    folders = {folder.resolve(): folder for folder in logs}  # each once
+    found = [entry for folder in folders.values() for entry in catalogue.entries(folder, wanted)]
+    found.sort(key=lambda entry: entry.name)  # which begins with its start
     if json:
         print(plain_json.dumps([catalogue.as_dict(entry) for entry in found], indent=1))
     else:
-        _console().print(_table(found))
+        _console().print(_table(found, several=len(folders) > 1))
     return 0
 
 
@@ -118,7 +122,8 @@ def _console() -> Console:
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 
-def _table(found: list[catalogue.RunEntry]) -> Table:
+def _table(found: list[catalogue.RunEntry], several: bool = False) -> Table:
+    """The table; with `several` folders, each run with its folder."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     words = {"run", "started, UTC", "configuration", "end"}
     numbers = ("length", "held", "std µm", "in band", "faults", "Kp", "Ti")
@@ -126,7 +131,7 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
         table.add_column(title, justify="left" if title in words else "right")
     for entry in found:
         table.add_row(
-            one_line(entry.name),
+            one_line(str(entry.folder) if several else entry.name),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             span(entry.duration_s),
             span(entry.held_s),

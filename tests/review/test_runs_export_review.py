@@ -97,6 +97,21 @@ def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--logs in front of `prune`" in capsys.readouterr().err
 
 
+def test_runs_of_several_folders_are_one_list(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    south = tmp_path / "south"
+    south.mkdir()
+    shutil.copytree(logs / "20261122T180000Z-night", south / "20261122T190000Z-later")
+    words = ["runs", "--logs", str(south), "--logs", str(logs), "--logs", f"{logs}/."]
+    assert command([*words, "--json"]) == 0
+    found = [Path(run["folder"]) for run in json.loads(capsys.readouterr().out)]
+    assert len(found) == len(set(found)) == 4, "a folder that is named twice counts once"
+    assert [folder.name[:8] for folder in found] == ["20261121", "20261122", "20261122", "20261123"]
+    assert {folder.parent.name for folder in found} == {"south", logs.name}
+    assert command(words) == 0
+    assert "south" in capsys.readouterr().out, "each run with its folder"
+    assert command([*words, "--logs", str(tmp_path / "absent")]) == 2
+
+
 def test_prune_spares_what_is_kept_and_says_before_it_does(tmp_path: Path) -> None:
     for day in range(1, 7):
         written(tmp_path, 0.01, name=f"202611{day:02}T180000Z-night")
