@@ -346,12 +346,13 @@ def run(count: int = BENCHES) -> list[Figure]:
 
 def table(given: list[dict[str, Any]]) -> list[str]:
     """Coverage for the sets with each cause, as lines of a page."""
-    lines = ["| cause | benches | height % | change % | width of change over scatter |", "|---|---|---|---|---|"]
+    head = "| cause | benches | height % | change % | live cycle % | live change % | width of change over scatter |"
+    lines = [head, "|" + 7 * "---|"]
     every = sorted({cause for one in given for cause in one["causes"]})
     for cause in ["(all)", *every]:
         some = [one for one in given if cause == "(all)" or cause in one["causes"]]
-        height, change = held(some, ""), held(some, "change_")
-        lines.append(f"| {cause} | {len(some)} | {100 * height[0]:.0f} | {100 * change[0]:.0f} | {change[1]:.1f} |")
+        shares = " | ".join(f"{100 * held(some, of)[0]:.0f}" for of in ("", "change_", "live_", "live_change_"))
+        lines.append(f"| {cause} | {len(some)} | {shares} | {held(some, 'change_')[1]:.1f} |")
     return lines
 
 

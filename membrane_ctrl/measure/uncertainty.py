@@ -25,12 +25,12 @@ from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
-# Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster, with identical numbers.
+# Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to twelve digits.
 
 _BATCH = 100  # trials per job: a tenth of a second, so that the bar moves and no worker waits for long
 # A process takes about two seconds to start (imports, compiled loops): less work than this stays in this process.
 _WORTH_PROCESSES = 5000
-_CONNECT_S = 10
+_CONNECT_S = 30
 
 
 def run_everywhere(
