@@ -196,8 +196,8 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
 # What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
 #
 # Rays are followed from a bowl at each depth to the screen, and the problem is solved from there. Its solution is the
-# bowl itself, and its covariance is within a tenth of that claimed by sets of a mounted film (docs/calibration.md). The
-# bowl has the figure of a film that is clamped by hand: a smooth one would claim a fifth more.
+# bowl itself, and its covariance is within a tenth of that claimed by sets of a mounted film (docs/calibration.md).
+# The bowl has the figure of a film that is clamped by hand: a smooth one would claim a fifth more.
 
 _MOUNTED_MM = np.zeros(PARAMETERS)
 _MOUNTED_MM[[3, 5, 7]] = 0.3, 0.1, 0.05  # astigmatism, coma, trefoil; and 10 um RMS over the terms above
