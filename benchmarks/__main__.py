@@ -29,6 +29,7 @@ NAMES = (
     "acquisition",
     "virtual_time",
     "held",
+    "centre",
     "laser_drift",
     "report_month",
     "events_found",

@@ -1,6 +1,6 @@
 """The centre held by everything that sees it, in virtual time on the twin: its true motion, and the filter's honesty.
 
-`run()` gives the figures, `python -m benchmarks.centre` prints them as the table of docs/estimator.md.
+`run()` gives the figures, `python -m benchmarks.centre` prints them one by one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.figures import Figure, at_most
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.centre import CentreFilter, CentreReadings
@@ -158,8 +159,8 @@ def bound_um(case: str) -> float:
     return least_std_um(loop, _bench(case, 1), sensors.laser, noise)
 
 
-def robust(draw: int, duration_s: float) -> dict[str, float]:
-    """A bench whose gains, delay, lag and noises differ by up to 30 % from what the filter is told."""
+def robust(draw: int, duration_s: float) -> float:
+    """Standard deviation in um on a bench whose gains, delay, lag and noises are up to 30 % off what is told."""
     off = 1 + np.random.default_rng(draw).uniform(-0.3, 0.3, 8)
     told, loop = EstimatorConfig(), LoopConfig()
     twin = _bench("all", draw + 1).model_copy(
@@ -177,26 +178,50 @@ def robust(draw: int, duration_s: float) -> dict[str, float]:
     }
     pump = PumpConfig(flow_full_um_per_s=PumpConfig().flow_full_um_per_s * off[7])
     held = hold(Sensors(), twin, duration_s + SETTLED_S, (), told, loop.model_copy(update=gains), pump)
-    return {"std_um": float(held.after(SETTLED_S).std()), "largest_um": float(np.abs(held.after(SETTLED_S)).max())}
+    return float(held.after(SETTLED_S).std())
 
 
-def run(seeds: int = 4, duration_s: float = 300.0, draws: int = 20) -> dict[str, Any]:
-    """All figures: root mean squares over the seeds, the largest of each for motion and peaks."""
-    figures: dict[str, Any] = {}
-    for case in CASES:
-        each = [steady(case, seed, duration_s) for seed in range(1, seeds + 1)]
-        rms = {name: float(np.sqrt(np.mean([one[name] ** 2 for one in each]))) for name in each[0]}
-        figures[case] = rms | {"moved_um": max(one["moved_um"] for one in each), "least_std_um": bound_um(case)}
-        if case in WITH_LEAK:
-            peaks_um = [leak_doubled(case, seed) for seed in range(1, seeds + 1)]
-            figures[case] |= {"leak_peak_um": float(np.mean(peaks_um)), "worst_leak_peak_um": max(peaks_um)}
-    wrong = [robust(draw, duration_s / 3) for draw in range(draws)]
-    figures["told wrong by 30 %"] = {
-        "std_um": float(np.median([one["std_um"] for one in wrong])),
-        "worst_std_um": max(one["std_um"] for one in wrong),
-        "largest_um": max(one["largest_um"] for one in wrong),
-    }
+# Targets by case: standard deviation in um, peak after a doubled leak in um.
+TARGETS = {"all": (0.065, 0.6), "optics alone": (0.08, 0.7), "laser alone": (0.12, 1.7), "all, quiet": (0.03, None),
+           "all, gusty": (0.22, None)}  # fmt: skip
+MOST_OVER_BOUND, MOVED_UM, MOST_WORSE = 1.4, 0.1, 1.5
+
+
+def of_case(case: str, seeds: int, duration_s: float) -> list[Figure]:
+    """Root mean squares over the seeds, mean peaks, the largest motion of 10 s means."""
+    each = [steady(case, seed, duration_s) for seed in range(1, seeds + 1)]
+    rms = {name: float(np.sqrt(np.mean([one[name] ** 2 for one in each]))) for name in each[0]}
+    std_um, peak_um = TARGETS.get(case, (None, None))
+    bound = bound_um(case)
+    figures = [
+        at_most(f"{case}: std of the true centre", rms["std_um"], "um", std_um, "bound", bound),
+        at_most(f"{case}: std over bound", rms["std_um"] / bound, "", MOST_OVER_BOUND),
+        Figure(f"{case}: error over sigma", rms["error_over_sigma"], ""),
+    ]
+    if "drifts" in case:
+        moved_um = max(one["moved_um"] for one in each)
+        figures.append(at_most(f"{case}: true centre moved", moved_um, "um", MOVED_UM))
+    if case in WITH_LEAK:
+        peaks_um = [leak_doubled(case, seed) for seed in range(1, seeds + 1)]
+        figures.append(at_most(f"{case}: peak after a doubled leak", float(np.mean(peaks_um)), "um", peak_um))
+        figures.append(Figure(f"{case}: worst such peak", max(peaks_um), "um"))
     return figures
+
+
+def told_wrong(draws: int, duration_s: float) -> list[Figure]:
+    """Everything that the filter is told is wrong by up to 30 %."""
+    nominal_um = steady("all", 1, duration_s)["std_um"]
+    stds_um = [robust(draw, duration_s) for draw in range(draws)]
+    return [
+        at_most("told wrong by 30 %: worst std", max(stds_um), "um", MOST_WORSE * nominal_um, "as told", nominal_um),
+        Figure("told wrong by 30 %: median std", float(np.median(stds_um)), "um", "as told", nominal_um),
+    ]
+
+
+def run(seeds: int = 4, duration_s: float = 300.0, draws: int = 20) -> list[Figure]:
+    """All figures."""
+    figures = [figure for case in CASES for figure in of_case(case, seeds, duration_s)]
+    return figures + told_wrong(draws, duration_s / 3)
 
 
 if __name__ == "__main__":
@@ -205,5 +230,7 @@ if __name__ == "__main__":
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--duration", type=float, default=300.0, help="seconds of each run")
     arguments = parser.parse_args()
-    for name, case in run(arguments.seeds, arguments.duration, arguments.draws).items():
-        print(f"| {name} | " + " | ".join(f"{key} {value:.3f}" for key, value in case.items()) + " |")
+    parts = [lambda case=case: of_case(case, arguments.seeds, arguments.duration) for case in CASES]
+    for part in (*parts, lambda: told_wrong(arguments.draws, arguments.duration / 3)):
+        for figure in part():
+            print(f"{figure.name} | {figure.value:.3f} | {figure.target}", flush=True)

@@ -255,7 +255,7 @@ class EstimatorConfig(Section):
     """Time constant of the pump. Change it to what `tune` found."""
     laser_noise_um: Annotated[float, Field(gt=0, le=100)] = 1.0
     """Noise of a laser reading; a hold learns it within a factor of 5. Change it to your laser's."""
-    optics_noise_um: Annotated[float, Field(gt=0, le=100)] = 0.02
+    optics_noise_um: Annotated[float, Field(gt=0, le=100)] = 0.01
     """Noise of a measured sag beyond the one that its message states. Raise it for optics that tremble."""
     barometer_noise_pa: Annotated[float, Field(gt=0, le=100)] = 0.05
     """Noise of the barometer; a hold learns it within a factor of 5. Change it to your barometer's."""
@@ -265,7 +265,7 @@ class EstimatorConfig(Section):
     """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
     air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
     """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
-    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.06
+    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.05
     """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.025
     """Unrest of the leak: a larger one answers a new leak sooner and passes more noise.

@@ -65,10 +65,12 @@ def set_to(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
     ("fail", "holders"),
     [
         (set_to("no_light", True), [ALL, "optics, barometer, thermometer", ALL]),
-        (set_to("laser_stuck", True), [ALL]),
+        pytest.param(set_to("laser_stuck", True), [ALL], marks=pytest.mark.campaign),
         (set_to("camera_lost", True), [ALL, "laser, barometer, thermometer", ALL]),
-        (set_to("barometer_lost", True), [ALL, "laser, optics, thermometer", ALL]),
-        (set_to("laser_offset_um", 12.0), [ALL, ALL, ALL]),
+        pytest.param(
+            set_to("barometer_lost", True), [ALL, "laser, optics, thermometer", ALL], marks=pytest.mark.campaign
+        ),
+        pytest.param(set_to("laser_offset_um", 12.0), [ALL, ALL, ALL], marks=pytest.mark.campaign),
     ],
     ids=["no laser", "stuck laser", "no camera", "no barometer", "knocked laser"],
 )
@@ -80,6 +82,7 @@ def test_a_lost_sensor_makes_no_bump_and_no_fault(fail: Callable[[Wrong, bool], 
     assert ticks[-1].row.state == State.HOLD
 
 
+@pytest.mark.campaign
 def test_without_laser_and_optics_the_flow_is_held_until_one_is_back() -> None:
     def fail(wrong: Wrong, fails: bool) -> None:
         wrong.no_light = wrong.camera_lost = fails
