@@ -26,6 +26,8 @@ from membrane_ctrl.model.arrays import FloatArray
 # An error of the reference remains as an offset of the figure: the mean has less than half the scatter of one shape,
 # at the price of a few cycles without the trim.
 SHAPES = 5
+# Figures of single frames come faster than the laser's noise averages out: as many readings as five cycles have.
+TRACKED_SHAPES, TRACKED_EVERY_S = 25, 0.4
 
 
 class ReferenceMean:
@@ -39,7 +41,7 @@ class ReferenceMean:
     @property
     def wanted(self) -> int:
         """Number of shapes that make a reference."""
-        return SHAPES
+        return TRACKED_SHAPES if self._taken and self._taken[-1].kind == "track" else SHAPES
 
     @property
     def count(self) -> int:
@@ -49,10 +51,12 @@ class ReferenceMean:
     @property
     def complete(self) -> bool:
         """Whether there are enough."""
-        return self.count == SHAPES
+        return self.count >= self.wanted
 
     def take(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Take one more."""
+        """Take one more; of single frames, one per `TRACKED_EVERY_S`."""
+        if self._taken and estimate.kind == "track" and estimate.time_s < self._taken[-1].time_s + TRACKED_EVERY_S:
+            return
         self._taken.append(estimate)
         self.coeffs_um = np.mean([e.coeffs_um for e in self._taken], axis=0)
         self.displacement_um = float(np.mean([e.displacement_um for e in self._taken]))

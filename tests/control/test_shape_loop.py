@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
-from membrane_ctrl.control.shape_loop import SHAPES, ShapeLoop, ShapeOutput
+from membrane_ctrl.control.shape_loop import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES, ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.states import ShapeState
 
@@ -62,6 +62,18 @@ def test_reference_is_taken_first() -> None:
     out = bench.run(PERIOD_S)
     assert (out.state, out.reason, out.trim_um) == (ShapeState.TRACKING, "", 0.0)
     assert math.isnan(out.sag_change_um)
+
+
+def test_single_frames_make_a_reference_of_as_many_readings() -> None:
+    """Twenty figures a second share the laser's readings: five of them would be a quarter of a second."""
+    bench = Bench()
+    for k in range(12 * 20):
+        bench.now_s = k / 20
+        out = bench.loop.step(bench.now_s, 0.05, bench.estimate(kind="track", time_s=bench.now_s), 0.0, True)
+        if out.state == ShapeState.TRACKING:
+            break
+    assert bench.now_s == pytest.approx((TRACKED_SHAPES - 1) * TRACKED_EVERY_S, abs=1.3)
+    assert bench.loop.step(12.0, 0.05, None, 0.0, True).reason == ""
 
 
 def test_nothing_is_learnt_before_the_loop_is_settled() -> None:

@@ -41,7 +41,7 @@ _FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not
 
 @kernel
 def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  # type: ignore[no-untyped-def]
-    """Rows of `out` (7, n): w r dI/dphi_x, w r dI/dphi_y, w r, w r cos x, w r cos y; residual r, weight w.
+    """Rows of `out` (7, n): w r times dI by phi_x, by phi_y, by A, by B_x, by B_y; residual r, weight w.
 
     `maps` (3, n) are level and swings, `reach` (n,) is where Tukey's weight ends; 0 leaves a bin out.
     """
@@ -51,7 +51,7 @@ def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  
         y = base[1, p] + turn[1, p] + shifts[1]
         cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
         light = maps[0, p] + maps[1, p] * cx + maps[2, p] * cy
-        steep_x, steep_y = maps[1, p], maps[2, p]
+        steep_x, steep_y, twice = maps[1, p], maps[2, p], 0.0
         if bent:
             v = 0.5 + 0.25 * (cx + cy)
             most = 2 * (steep_x + steep_y)
@@ -61,6 +61,7 @@ def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  
                 power *= v
                 h += response[k] * (power - v)
             light += most * h
+            twice = 2 * h
             steep_x += most * slope / 4
             steep_y += most * slope / 4
         r = seen[p] - light
@@ -69,8 +70,8 @@ def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  
         out[0, p] = -w * r * steep_x * sx
         out[1, p] = -w * r * steep_y * sy
         out[2, p] = w * r
-        out[3, p] = w * r * cx
-        out[4, p] = w * r * cy
+        out[3, p] = w * r * (cx + twice)
+        out[4, p] = w * r * (cy + twice)
         out[5, p] = r
         out[6, p] = w
 
@@ -139,7 +140,7 @@ class FrameFitter:
             self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)
             if self._inverse is None and matrices < _MAX_MATRICES:
                 self._inverse = self._inverted(shifts_rad, shape)
-                matrices += 1
+                matrices, change = matrices + 1, math.inf  # its first step is not judged by an old one's last
             if self._inverse is None:
                 break
             delta, last = self._inverse @ self._right(), change
@@ -179,16 +180,27 @@ class FrameFitter:
         return np.concatenate([of_surface, of_light.ravel()]).astype(float)
 
     def _columns(self, shifts_rad: tuple[float, float], shape: Surface) -> Singles:
-        """J (144, n) for a straight panel."""
+        """J (144, n)."""
         moved = (shape.parameters - self._traced.parameters).astype(np.float32)
         x, y = self._base + moved @ self.jacobian + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         swing_x, swing_y = self._maps[1], self._maps[2]
         level, first, second = self._light_adu
         out = np.empty((_UNKNOWNS, self.scene.index.size), np.float32)
-        out[:PARAMETERS] = -swing_x * np.sin(x) * self.jacobian[0] - swing_y * np.sin(y) * self.jacobian[1]
-        for k, wave in enumerate((level, first * np.cos(x), second * np.cos(y))):
+        slope, twice = self._bent(x, y)
+        steeper = (swing_x + swing_y) / 2 * slope
+        out[:PARAMETERS] = -(swing_x + steeper) * np.sin(x) * self.jacobian[0]
+        out[:PARAMETERS] -= (swing_y + steeper) * np.sin(y) * self.jacobian[1]
+        for k, wave in enumerate((level, first * (np.cos(x) + twice), second * (np.cos(y) + twice))):
             out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self.scene.basis * wave
         return out
+
+    def _bent(self, x: Singles, y: Singles) -> tuple[Singles, Singles]:
+        """Slope (n,) of what the panel's response adds to a straight line, and twice its value, as in `_model`."""
+        v = 0.5 + 0.25 * (np.cos(x) + np.cos(y))
+        bent = list(enumerate(self.scene.response, start=2))
+        slope = sum(c * (k * v ** (k - 1) - 1) for k, c in bent)
+        twice = sum(2 * c * (v**k - v) for k, c in bent)
+        return np.asarray(slope, np.float32), np.asarray(twice, np.float32)
 
     def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""

@@ -25,6 +25,7 @@ _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
 _RESPONSE_POWERS = (2, 3, 4, 5)
+_RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
 @dataclass(frozen=True)
@@ -102,9 +103,14 @@ def scene_of(
     traced = tracer.predict_screen(figure.points, shape)
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
     fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
-    fine.reshape(5, -1)[:2, figure.index] = figure.points.screen_mm - traced
+    coarser_rad = traced / phase.mm_per_rad(optics.pattern)  # the reference's errors repeat with its fringes
+    for axis, beyond_mm in enumerate(figure.points.screen_mm - traced):
+        fine[axis].reshape(-1)[figure.index] = _without_harmonics(beyond_mm, coarser_rad[axis])
+    response, level_range = _response(checked, figure, traced, phase.mm_per_rad(optics.pattern), optics)
     fine[2] = checked.view.light
     fine[3:] = contrast * checked.view.swing_adu.mean(axis=0) / 2  # each axis has half of the panel's range
+    if level_range is not None:
+        fine[2:].reshape(3, -1)[:, figure.index] = level_range * np.array([[1.0], [contrast / 4], [contrast / 4]])
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
@@ -124,7 +130,7 @@ def scene_of(
         light_adu=coarse[2:, index].copy(),
         basis=zernike.values(*position / shape.radius_mm).astype(np.float32),
         position_mm=position,
-        response=_response(checked, figure, traced, phase.mm_per_rad(optics.pattern), optics),
+        response=response,
         rad_per_mm=rad_per_mm,
         half_side_mm=optics.pattern.periods * optics.pattern.period_mm / 2,
     )
@@ -159,24 +165,40 @@ def _coarser(fine: FloatArray, side: int) -> FloatArray:
 
 def _response(
     checked: Checked, figure: full.BinFigure, traced_mm: FloatArray, mm_per_rad: float, optics: OpticsConfig
-) -> FloatArray:
-    """The panel's response from the reference's sinusoids, between its black and its white frame."""
+) -> tuple[FloatArray, FloatArray | None]:
+    """The panel's response from the reference's sinusoids, between its black and its white frame; level and range.
+
+    Steps put harmonics of the reference's fringes into their mean and their swing, the fourth where there are four: a
+    ripple that stands where the crossed fringes are four times finer, and looks like a tilt that turns with their
+    steps. The level is without it, and the range is that of black and white: (3, n) of level, range, range; None
+    without those.
+    """
     stack, index = checked.stack, figure.index
-    none = np.zeros(len(_RESPONSE_POWERS))
+    straight = np.zeros(len(_RESPONSE_POWERS))
     white, black = (stack.single(role) for role in ("white", "black"))
     bad = {flag.frame for flag in checked.flags} | set(stack.unusable)
     if white is None or black is None or {white, black} & bad:
-        return none
+        return straight, None
     low, high = (checked.binned.means[k].reshape(-1)[index].astype(float) for k in (black, white))
-    shown, seen = [], []
+    shown, seen, levels = [], [], []
     for axis, used in enumerate(checked.view.used):
         phases = traced_mm[axis] / mm_per_rad + phase.centre_phase_rad(optics.pattern)
         for frame in used:
             shown.append((1 + np.cos(phases + stack.patterns[frame].shift_rad)) / 2)
             seen.append((checked.binned.means[frame].reshape(-1)[index] - low) / (high - low))
+        levels.append(_without_harmonics(np.mean(seen[-len(used) :], axis=0), phases))
     v, y = np.concatenate(shown), np.concatenate(seen)
     columns = np.stack([v**k - v for k in _RESPONSE_POWERS])
     solved = np.linalg.solve(columns @ columns.T, columns @ (y - v))
-    level = np.linspace(0, 1, 101)
-    deviation = solved @ np.stack([level**k - level for k in _RESPONSE_POWERS])
-    return solved if np.abs(deviation).max() > _HARMONIC else none
+    shades = np.linspace(0, 1, 101)
+    deviation = solved @ np.stack([shades**k - shades for k in _RESPONSE_POWERS])
+    response = solved if np.abs(deviation).max() > _HARMONIC else straight
+    whole = high - low
+    return response, np.stack([low + whole * np.mean(levels, axis=0), whole, whole])
+
+
+def _without_harmonics(values: FloatArray, phase_rad: FloatArray) -> FloatArray:
+    """Values (n,) less what repeats with the phases (n,)."""
+    turns = np.arange(1, _RIPPLES + 1)[:, None] * phase_rad
+    waves = np.concatenate([np.ones((1, phase_rad.size)), np.cos(turns), np.sin(turns)])
+    return np.asarray(values - np.linalg.solve(waves @ waves.T, waves @ values)[1:] @ waves[1:])

@@ -186,21 +186,29 @@ class Tracker:
     def _take_steps(self, shifts_rad: tuple[float, float]) -> None:
         """Renew the scene if the frames before this one were the last of five steps that separate the axes.
 
-        Five steps determine the five unknowns of a bin, whatever motion is assumed between them. What the fits of the
-        steps say of it is true as far as the light is known; over many frames a held mirror is still.
+        Five steps determine the five unknowns of a bin, whatever motion is assumed between them: what the fits of the
+        steps say of it is true only as far as the light is known. A held mirror changes its bowl alone, and over many
+        frames is still.
         """
-        steps = self._steps
+        steps, radius_mm = self._steps, self._last.surface.radius_mm
         if len(steps) < ENOUGH_STEPS or steps[-1].shifts_rad == shifts_rad:
             return
         shown = np.array([step.shifts_rad for step in steps])
-        fits = [step.fit(self._last.surface.radius_mm) for step in steps]
+        fits = [step.fit(radius_mm) for step in steps]
+        parameters = np.array([fit.surface.parameters for fit in fits])
+        mean_mm = parameters.mean(axis=0)
+        bowl = surface.Surface.hencky_bowl(1.0, radius_mm).parameters
+        deeper_mm = np.array([fit.surface.sag_mm for fit in fits])
+        deeper_mm -= deeper_mm.mean()
         if min(step.count for step in steps) >= _STANDING_FRAMES:
-            parameters = np.array([fit.surface.parameters for fit in fits])
-            mean_mm = parameters.mean(axis=0)
             if np.max(np.abs(surface.height_probe() @ (parameters - mean_mm).T)) > _STANDING_MM:
                 return
-            mean = surface.Surface.from_parameters(mean_mm, self._last.surface.radius_mm)
-            fits = [replace(fit, surface=mean) for fit in fits]
+            deeper_mm[:] = 0.0
+        places = mean_mm + np.outer(deeper_mm, bowl)
+        fits = [
+            replace(fit, surface=surface.Surface.from_parameters(place, radius_mm))
+            for fit, place in zip(fits, places, strict=True)
+        ]
         if separable(shown):
             self._renew(fits, np.stack([step.seen_adu() for step in steps]), shown)
 
