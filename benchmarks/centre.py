@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, at_most
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.control.centre import CentreFilter, CentreReadings
+from membrane_ctrl.control.centre import CentreFilter
+from membrane_ctrl.control.centre_estimate import CentreReadings
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.sim.bench_events import LeakChange
 from membrane_ctrl.sim.plant import BenchEvent, Plant

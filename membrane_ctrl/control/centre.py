@@ -11,14 +11,12 @@ late reading is exact, whenever it comes.
 """
 
 import math
-from collections import deque
 from dataclasses import dataclass, field
-from enum import IntEnum
-from itertools import islice
 
 import numpy as np
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
+from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
 from membrane_ctrl.control.filters import smoothing
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.control.sensor_noise import WalkNoise, Whiteness
@@ -40,122 +38,6 @@ _LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the st
 _SHARE_S = 2.0  # memory of the sensors' weights
 _OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
 Rows = tuple[tuple[int, float], ...]  # states and their factors in a reading's expectation
-
-
-class Sensor(IntEnum):
-    """What sees the centre, or what moves it."""
-
-    LASER = 0
-    OPTICS = 1
-    BAROMETER = 2
-    THERMOMETER = 3
-
-
-# How long after its last accepted reading a sensor still counts as seeing the mirror, at most.
-FRESH_S = {Sensor.LASER: 0.5, Sensor.OPTICS: 5.0, Sensor.BAROMETER: 5.0, Sensor.THERMOMETER: 5.0}
-
-
-@dataclass(frozen=True, slots=True)
-class CentreReadings:
-    """Readings of one tick; NaN for missing ones."""
-
-    now_s: float
-    flow_um_per_s: float  # commanded since the last tick
-    laser_um: float
-    ambient_pressure_pa: float
-    air_temperature_c: float
-    sag_um: float = math.nan
-    sag_sigma_um: float = math.nan
-    sag_time_s: float = math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class SensorView:
-    """One sensor's part in the estimate."""
-
-    fresh: bool  # the estimate follows it
-    innovation: float  # last reading minus expectation, in standard deviations; NaN before the first
-    share: float  # of the corrections of the centre, 0..1
-
-
-@dataclass(frozen=True, slots=True)
-class CentreEstimate:
-    """The centre in um, as the laser would read it without noise.
-
-    Attributes
-    ----------
-    um, sigma_um : float
-        Centre plus mount, and the standard deviation of the centre.
-    mount_um : float
-        Displacement of the laser's mount: the true centre is `um - mount_um`.
-    ahead_um : float
-        Where the gas in transit takes it, if the pump from now on balances `drift_um_per_s`.
-    due_um_per_s : float
-        Flow at the end of the dead time, less `drift_um_per_s`.
-    leak_um_per_s, drift_um_per_s : float
-        Loss of gas, and that less the lift of the warming gas.
-    sensors : tuple of SensorView
-        By `Sensor`.
-    jumped : tuple of str
-        Sensors whose readings have jumped in this tick, in words.
-    """
-
-    um: float
-    sigma_um: float
-    mount_um: float
-    ahead_um: float
-    due_um_per_s: float
-    leak_um_per_s: float
-    drift_um_per_s: float
-    sensors: tuple[SensorView, ...]
-    jumped: tuple[str, ...] = ()
-
-    def telemetry(self) -> dict[str, float]:
-        """What a telemetry row says of it."""
-        told = {
-            f"{sensor.name.lower()}_innovation": view.innovation
-            for sensor, view in zip(Sensor, self.sensors, strict=True)
-            if view.fresh
-        }
-        return {"estimate_sigma_um": self.sigma_um, "optics_share": self.sensors[Sensor.OPTICS].share, **told}
-
-
-class Transit:
-    """Gas between pump and mirror: a dead time, then a lag, in ticks of `period_s`."""
-
-    def __init__(self, delay_s: float, lag_s: float, period_s: float) -> None:
-        self._ticks = int(delay_s / period_s + 1e-9)
-        self._rest = max(0.0, delay_s / period_s - self._ticks)
-        self._delay_s, self._lag_s, self._period_s = delay_s, lag_s, period_s
-        self._flows: deque[float] = deque([0.0] * (self._ticks + 2), maxlen=self._ticks + 2)  # newest first
-        self._arriving = 0.0
-
-    def place(self, flow_um_per_s: float) -> None:
-        """Everything flows at this rate."""
-        self._flows.extend([flow_um_per_s] * len(self._flows))
-        self._arriving = flow_um_per_s
-
-    def advance(self, flow_um_per_s: float, dt_s: float) -> float:
-        """Pump at a rate for a step; returns the rise of the centre in it, um."""
-        for _ in range(max(1, round(dt_s / self._period_s))):
-            self._flows.appendleft(flow_um_per_s)
-        late = (1 - self._rest) * self._flows[self._ticks] + self._rest * self._flows[self._ticks + 1]
-        moved = smoothing(dt_s, self._lag_s) * (late - self._arriving)
-        self._arriving += moved
-        return late * dt_s - self._lag_s * moved
-
-    def coming_um(self, drift_um_per_s: float) -> float:
-        """Rise still to come, if from now on the pump gives the drift."""
-        pending = self._period_s * (sum(islice(self._flows, self._ticks)) + self._rest * self._flows[self._ticks])
-        return pending - drift_um_per_s * self._delay_s + self._lag_s * (self._arriving - drift_um_per_s)
-
-    def due_um_per_s(self) -> float:
-        """Flow at the end of the dead time: what the pump now receives comes on top of it."""
-        flow = self._arriving
-        for late in range(self._ticks, -1, -1):
-            step_s = self._period_s * (self._rest if late == self._ticks else 1.0)
-            flow += smoothing(step_s, self._lag_s) * (self._flows[late] - flow)
-        return flow
 
 
 @dataclass(slots=True)

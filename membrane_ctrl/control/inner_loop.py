@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
-from membrane_ctrl.control import centre, film_health, filters, gas, pid, pump_drift
+from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
+from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
@@ -23,7 +24,7 @@ class LoopInput:
     displacement_um: float  # laser reading, as read
     ambient_pressure_pa: float  # NaN without a sensor
     air_temperature_c: float
-    estimate: centre.CentreEstimate | None = None  # held instead of the laser, if given
+    estimate: CentreEstimate | None = None  # held instead of the laser, if given
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,9 +160,7 @@ class InnerLoop:
         rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
-    def _on_estimate(
-        self, given: LoopInput, estimate: centre.CentreEstimate, dt_s: float
-    ) -> tuple[pid.PidTerms, float]:
+    def _on_estimate(self, given: LoopInput, estimate: CentreEstimate, dt_s: float) -> tuple[pid.PidTerms, float]:
         """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is the integrator.
 
         The prediction takes dead time and lag out of the loop, and the filter, which knows the flow after its limits,

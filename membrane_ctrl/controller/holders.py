@@ -5,7 +5,8 @@ from collections.abc import Collection
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import inner_loop
-from membrane_ctrl.control.centre import LOCK_FRAMES, CentreEstimate, CentreFilter, CentreReadings, Sensor
+from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.sensor_consistency import SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs

@@ -6,7 +6,8 @@ from typing import Literal
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control import centre, filters, inner_loop, shape_loop
+from membrane_ctrl.control import filters, inner_loop, shape_loop
+from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import pump_obeys, safe_levels, safety_rules, tick
@@ -47,7 +48,7 @@ class Scene:
     dt_s: float = 0.02
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     trim_um: float = 0.0
-    estimate: centre.CentreEstimate | None = None  # held instead of the laser's reading, if there is one
+    estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
     # requests
     hold_wanted: bool = False
     manual_wanted: bool = False
