@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# A test starts hundreds of processes: without bytecode each would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: hold test board board-fuzz board-hold rest lint types kernels fast real_time unit shake docs notebooks pictures bench campaign fuzz mutants generate clean
 .DEFAULT_GOAL := test

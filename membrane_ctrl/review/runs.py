@@ -1,6 +1,7 @@
 """`membrane-ctrl runs`: list, show, prune; `export`; `mark`."""
 
 import math
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +31,7 @@ def list_command(
     if json:
         print(plain_json.dumps([catalogue.as_dict(entry) for entry in found], indent=1))
     else:
-        _console().print(_table(found, several=len(folders) > 1))
+        _console().print(_table(found))
     return 0
 
 
@@ -122,8 +123,9 @@ def _console() -> Console:
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 
-def _table(found: list[catalogue.RunEntry], several: bool = False) -> Table:
-    """The table; with `several` folders, each run with its folder."""
+def _table(found: list[catalogue.RunEntry]) -> Table:
+    """The table; runs of several folders have names from where these part."""
+    common = os.path.commonpath([entry.folder.parent for entry in found]) if found else ""
     table = Table(box=None, header_style="bold", pad_edge=False)
     words = {"run", "started, UTC", "configuration", "end"}
     numbers = ("length", "held", "std µm", "in band", "faults", "Kp", "Ti")
@@ -131,7 +133,7 @@ def _table(found: list[catalogue.RunEntry], several: bool = False) -> Table:
         table.add_column(title, justify="left" if title in words else "right")
     for entry in found:
         table.add_row(
-            one_line(str(entry.folder) if several else entry.name),
+            one_line(str(entry.folder.relative_to(common))),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             span(entry.duration_s),
             span(entry.held_s),

@@ -113,12 +113,14 @@ def test_a_camera_bumped_and_put_back_is_named() -> None:
     assert finding.says.startswith("the camera had moved in set2")
 
 
+@pytest.mark.campaign
 def test_a_camera_that_was_moved_far_is_told_by_the_halves() -> None:
     (finding,) = judged(yawed(1.0, 3, 4))
     assert finding.fatal
     assert "between set2 and set3" in finding.says
 
 
+@pytest.mark.campaign
 def test_bins_are_not_averaged_about_a_bench_that_was_not_found() -> None:
     """What is asked afterwards of each half must find the points as they were seen."""
     other = VALUES.copy()

@@ -132,14 +132,15 @@ def test_trials_repeat_whatever_the_batches() -> None:
     assert np.abs(whole - run_trials([trial, trial], PAPER_SPREAD, 6, range(6), first_set=7)).max() > 1e-4
 
 
-def test_linear_covariance_is_the_monte_carlo_within_ten_per_cent() -> None:
+@pytest.mark.parametrize(("count", "within"), [(150, 0.3), pytest.param(1500, 0.1, marks=pytest.mark.campaign)])
+def test_linear_covariance_is_that_of_the_monte_carlo(count: int, within: float) -> None:
     trial = _bench()
-    sampled = MAP.sigma(trial_covariance(run_trials([trial], PAPER_SPREAD, 1, range(1500))[:, 0]))
+    sampled = MAP.sigma(trial_covariance(run_trials([trial], PAPER_SPREAD, 1, range(count))[:, 0]))
     linear = MAP.sigma(linear_covariance([trial], PAPER_SPREAD))
     seen = sampled > 1e-6  # all but the vertex
-    assert np.abs(linear[seen] / sampled[seen] - 1).max() < 0.1
-    noise = MAP.sigma(trial_covariance(run_trials([trial], NO_SPREAD, 1, range(1500))[:, 0]))
-    assert np.abs(MAP.sigma(noise_covariance(trial))[seen] / noise[seen] - 1).max() < 0.1
+    assert np.abs(linear[seen] / sampled[seen] - 1).max() < within
+    noise = MAP.sigma(trial_covariance(run_trials([trial], NO_SPREAD, 1, range(count))[:, 0]))
+    assert np.abs(MAP.sigma(noise_covariance(trial))[seen] / noise[seen] - 1).max() < within
 
 
 @pytest.mark.campaign

@@ -108,7 +108,7 @@ def test_runs_of_several_folders_are_one_list(logs: Path, tmp_path: Path, capsys
     assert [folder.name[:8] for folder in found] == ["20261121", "20261122", "20261122", "20261123"]
     assert {folder.parent.name for folder in found} == {"south", logs.name}
     assert command(words) == 0
-    assert "south" in capsys.readouterr().out, "each run with its folder"
+    assert "south/20261122T190000Z-later " in capsys.readouterr().out, "each run with its folder"
     assert command([*words, "--logs", str(tmp_path / "absent")]) == 2
 
 
