@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import Column, IntArray
 from membrane_ctrl.run_files import column_reader, streams
-from membrane_ctrl.run_files.segments import FAULTS, read_chunks, salvage
+from membrane_ctrl.run_files.segments import FAULTS, ending, read_chunks, salvage
 
 if TYPE_CHECKING:
     from rerun.chunk import Chunk
@@ -127,7 +127,13 @@ def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[
 
 def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]:
     try:
-        return read_chunks(path, entities)
+        chunks = read_chunks(path, entities)
+        closed, rest = ending(path)
+        if not closed and not rest:
+            column_reader.add_note(notes, f"{path.name}: has no end: still written, cut off, or its recorder killed")
+        if not rest:
+            return chunks
+        why = f"it ends {rest} bytes into a message"
     except FAULTS as error:
         why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
     try:

@@ -17,7 +17,7 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files import column_reader, rrd_reader, run_folder, shapes, streams, tables
 from membrane_ctrl.run_files.column_file import SUFFIX
-from membrane_ctrl.run_files.segments import is_closed
+from membrane_ctrl.run_files.segments import ending
 from membrane_ctrl.run_files.shapes import Shapes
 
 Block = dict[str, Column]
@@ -275,7 +275,7 @@ def open_run(path: str | Path) -> Run:
 
 def _is_closed(path: Path) -> bool:
     try:
-        return is_closed(path)
+        return ending(path)[0]
     except OSError:
         return False
 

@@ -180,15 +180,20 @@ def whole_messages(path: Path) -> list[SegmentMessage]:
     return found
 
 
-def is_closed(path: Path) -> bool:
-    """Whether consecutive messages reach the end of a closed file; does not read their content.
+def ending(path: Path) -> tuple[bool, int]:
+    """Whether consecutive messages reach the end of a closed file, and else the bytes after the last complete one.
+
+    Does not read the content of messages. Rerun takes a file that ends between two messages, or within the head of
+    one, as whole.
 
     Raises
     ------
     OSError
     """
-    found = whole_messages(path)
-    return bool(found) and found[-1].kind == END and path.stat().st_size == found[-1].end + _FOOTER_BYTES
+    found, size = whole_messages(path), path.stat().st_size
+    behind = size - (found[-1].end if found else 0)
+    closed = bool(found) and found[-1].kind == END and behind == _FOOTER_BYTES
+    return closed, 0 if closed else behind
 
 
 # Recovers the intact part of a Rerun segment that Rerun refuses: truncated, or damaged within.

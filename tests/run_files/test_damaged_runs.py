@@ -19,6 +19,7 @@ from membrane_ctrl.review import open_run
 from membrane_ctrl.run_files.column_file import FILE_S
 from membrane_ctrl.run_files.column_reader import column_files
 from membrane_ctrl.run_files.sealed_stream import unseal, whole_batches
+from membrane_ctrl.run_files.segments import whole_messages
 from tests.support.review_runs import segment, set_summary, tables, written
 
 HOURS = 0.1
@@ -199,20 +200,26 @@ def test_the_last_file_of_a_table_is_missed_and_its_segment_stands_in(tmp_path: 
     assert any("Rerun segments replace ticks" in note for note in run.notes)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
-def test_a_torn_segment_gives_its_whole_messages(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize(("share", "behind"), [(0.3, 0), (0.3, 15), (0.6, 1), (0.6, 16), (0.9, 400)])
+def test_a_torn_segment_gives_its_whole_messages(tmp_path: Path, share: float, behind: int) -> None:
+    """Rerun takes a file that ends between two messages, or within the head of one (16 bytes), as whole."""
     rows, _ = night(4, 0.02, "typical", [])
     path = segment(tmp_path, rows)
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    messages = whole_messages(path)
+    path.write_bytes(path.read_bytes()[: messages[int(share * len(messages))].end + behind])
     before = _content(tmp_path)
     run = open_run(tmp_path)
     found = run.ticks(["displacement_um"])
     count = found.num_rows
     assert 0.5 * share * len(rows) < count <= len(rows)
     assert np.allclose(found.column("displacement_um"), column(rows[:count], "displacement_um"), equal_nan=True)
-    assert any(
-        "night-000.rrd: damaged or truncated" in note and "kB of it are left out" in note for note in run.notes
-    )
+    told = [note for note in run.notes if note.startswith("night-000.rrd: ")]
+    assert len(told) == 1
+    if behind:
+        assert "damaged or truncated" in told[0]
+        assert f"{behind / 1e3:.1f} kB of it are left out" in told[0]
+    else:
+        assert "has no end" in told[0]
     assert _content(tmp_path) == before
 
 
