@@ -3,14 +3,14 @@
 import math
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.model.telemetry import TelemetryRow
 
-_RUNGS = {
-    Rung.HOLD_FLOW: "pump keeps its last mean flow",
-    Rung.RAMP_DOWN: "pump is ramped down",
-    Rung.PUMP_OFF: "pump is off",
-    Rung.VENT: "pump is off and the vent is open",
+_LEVELS = {
+    SafeLevel.HOLD_FLOW: "pump keeps its last mean flow",
+    SafeLevel.RAMP_DOWN: "pump is ramped down",
+    SafeLevel.PUMP_OFF: "pump is off",
+    SafeLevel.VENT: "pump is off and the vent is open",
 }
 _STATES = {
     State.STANDBY: "pump is off: no hold was requested",
@@ -43,14 +43,14 @@ def holders(row: TelemetryRow) -> str:
 
 def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
-    state, rung = State(int(row.state)), Rung(int(row.rung))
-    if rung != Rung.NONE:
-        return f"{_RUNGS[rung]}: {fault or told or 'unknown fault'}"
+    state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
+    if safe_level != SafeLevel.NONE:
+        return f"{_LEVELS[safe_level]}: {fault or told or 'unknown fault'}"
     if state in _STATES:
         return told or _STATES[state]
     sees = math.isfinite(row.displacement_um) or math.isfinite(row.estimate_sigma_um)
     if not (sees and math.isfinite(row.filtered_um)):
-        return f"{_RUNGS[Rung.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
+        return f"{_LEVELS[SafeLevel.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
     if told.startswith("paused"):
         return told
     if state == State.INFLATE:

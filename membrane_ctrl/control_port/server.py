@@ -324,7 +324,7 @@ def status_table(status: run_status.RunStatus) -> dict[str, Any]:
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
         "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
-        "rung": states.Rung(int(row.rung)).name.lower(),
+        "safe_level": states.SafeLevel(int(row.safe_level)).name.lower(),
         "shape": states.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
         "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,

@@ -27,7 +27,7 @@ from membrane_ctrl.controller.scene import Scene, telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
@@ -235,7 +235,7 @@ class Controller:
                 scene.way_down = "stop"
                 scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
             case "vent" if self.state == State.FAULT:
-                scene.levels.enter(Rung.VENT, scene.now_s)
+                scene.levels.enter(SafeLevel.VENT, scene.now_s)
             case "lower" | "vent":
                 scene.way_down = scene.way_down or "lower"
                 scene.venting |= command.kind == "vent"
@@ -247,7 +247,7 @@ class Controller:
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
-        if command.kind in ("manual", "tune") and scene.levels.rung != Rung.NONE:
+        if command.kind in ("manual", "tune") and scene.levels.safe_level != SafeLevel.NONE:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
             now_um = self._setpoint_back_um if math.isfinite(self._setpoint_back_um) else scene.setpoint_um
@@ -306,21 +306,21 @@ class Controller:
         scene, levels = self._scene, self._scene.levels
         rule = verdict.rule
         if rule is None:
-            if levels.rung == Rung.HOLD_FLOW:
+            if levels.safe_level == SafeLevel.HOLD_FLOW:
                 levels.clear(scene.now_s)
                 events.append(told.Cleared(self.fault.name if self.fault else ""))
                 self.fault = None
             return
-        if self.fault is None or (rule.rung > Rung.HOLD_FLOW >= levels.rung):
+        if self.fault is None or (rule.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
             self.fault = rule
             events.append(rule.fault(verdict.seen))
-        levels.enter(rule.rung, scene.now_s)
-        if levels.step(scene.now_s) > Rung.HOLD_FLOW and self.state != State.FAULT:
+        levels.enter(rule.safe_level, scene.now_s)
+        if levels.step(scene.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
         scene = self._scene
-        settled = self.state == State.HOLD and scene.levels.rung == Rung.NONE
+        settled = self.state == State.HOLD and scene.levels.safe_level == SafeLevel.NONE
         shape = self._shape.step(
             inputs.now_s,
             scene.dt_s,
@@ -345,7 +345,7 @@ class Controller:
         except Exception as error:
             self._tick_error = f"{type(error).__name__}: {error}"
             # an error must not close an open vent
-            vents = scene.venting or scene.levels.rung == Rung.VENT
+            vents = scene.venting or scene.levels.safe_level == SafeLevel.VENT
             scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
             if self.state == State.FAULT:  # no safer state is left
                 scene.finished = errors.Exit.SAFETY_TRIP

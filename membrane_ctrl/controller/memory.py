@@ -16,6 +16,7 @@ from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import pump_obeys, safety, safety_rules
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.model import object_codec, shape_estimate
+from membrane_ctrl.model.telemetry import TODAY
 
 _RULES = {rule.code: rule for rule in safety.TABLE}
 _BYTES_MAX = 1 << 20  # a memory takes some 30 kB, decompressed
@@ -47,6 +48,8 @@ def recall(memory: bytes, fresh: Controller) -> Controller:
         text = expander.decompress(memory, _BYTES_MAX)
         if not expander.eof:
             raise object_codec.CodecError("truncated or too long")
+        for former, name in TODAY.items():
+            text = text.replace(f'"{former}":'.encode(), f'"{name}":'.encode())
         controller = decoder.decode(json.loads(text), Controller)
     except (zlib.error, ValueError, RecursionError) as error:
         raise UnknownMemoryError(f"the recorded memory cannot be used: {error}") from None

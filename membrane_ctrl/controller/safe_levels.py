@@ -1,7 +1,7 @@
 """The safe levels: hold the last mean flow -> ramp down -> pump off -> vent.
 
-A fault chooses the rung to enter; each rung times out into the next; only a clear observation on the first rung
-leads back up. The first rung's time recovers only as fast as it is used, so a cause present more than half of the
+A fault chooses the level to enter; each level times out into the next; only a clear observation on the first level
+leads back up. The first level's time recovers only as fast as it is used, so a cause present more than half of the
 time also times out.
 """
 
@@ -11,7 +11,7 @@ from collections import deque
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import LimitsConfig, ResumeConfig, StatesConfig
 from membrane_ctrl.controller.safety_rules import Observation, Rule
-from membrane_ctrl.model.states import Rung
+from membrane_ctrl.model.states import SafeLevel
 
 
 class SafeLevels:
@@ -19,41 +19,41 @@ class SafeLevels:
 
     def __init__(self, config: StatesConfig) -> None:
         self._limit_s = {
-            Rung.HOLD_FLOW: config.hold_flow_max_s,
-            Rung.RAMP_DOWN: config.ramp_down_s,
-            Rung.PUMP_OFF: config.pump_off_max_s,
+            SafeLevel.HOLD_FLOW: config.hold_flow_max_s,
+            SafeLevel.RAMP_DOWN: config.ramp_down_s,
+            SafeLevel.PUMP_OFF: config.pump_off_max_s,
         }
-        self.rung = Rung.NONE
+        self.safe_level = SafeLevel.NONE
         self._since_s = 0.0
         self._used_s = self._cleared_s = 0.0  # HOLD_FLOW's used time when last left, and the moment of leaving
 
-    def enter(self, rung: Rung, now_s: float) -> None:
-        """Enter a rung if it is deeper than the present one."""
-        if rung > self.rung:
-            used_s = max(0.0, self._used_s - (now_s - self._cleared_s)) if rung == Rung.HOLD_FLOW else 0.0
-            self.rung = rung
+    def enter(self, safe_level: SafeLevel, now_s: float) -> None:
+        """Enter a level if it is deeper than the present one."""
+        if safe_level > self.safe_level:
+            used_s = max(0.0, self._used_s - (now_s - self._cleared_s)) if safe_level == SafeLevel.HOLD_FLOW else 0.0
+            self.safe_level = safe_level
             self._since_s = now_s - used_s
 
     def clear(self, now_s: float) -> None:
         """Leave the safe levels, but only from HOLD_FLOW: all deeper ones are latched."""
-        assert self.rung == Rung.HOLD_FLOW, self.rung
+        assert self.safe_level == SafeLevel.HOLD_FLOW, self.safe_level
         self._used_s, self._cleared_s = self.age_s(now_s), now_s
-        self.rung = Rung.NONE
+        self.safe_level = SafeLevel.NONE
 
     def leave(self) -> None:
-        """Leave the safe levels from any rung, after an acknowledgement or by the resume rule."""
-        self.rung, self._used_s = Rung.NONE, 0.0
+        """Leave the safe levels from any level, after an acknowledgement or by the resume rule."""
+        self.safe_level, self._used_s = SafeLevel.NONE, 0.0
 
     def age_s(self, now_s: float) -> float:
-        """Time on the present rung; on HOLD_FLOW including earlier time not yet recovered."""
+        """Time on the present level; on HOLD_FLOW including earlier time not yet recovered."""
         return now_s - self._since_s
 
-    def step(self, now_s: float) -> Rung:
-        """Return the present rung, or the next one after a time-out."""
-        limit_s = self._limit_s.get(self.rung)
+    def step(self, now_s: float) -> SafeLevel:
+        """Return the present level, or the next one after a time-out."""
+        limit_s = self._limit_s.get(self.safe_level)
         if limit_s is not None and self.age_s(now_s) > limit_s:
-            self.enter(Rung(self.rung + 1), now_s)
-        return self.rung
+            self.enter(SafeLevel(self.safe_level + 1), now_s)
+        return self.safe_level
 
 
 DAY_S = 86_400.0
@@ -122,7 +122,7 @@ class ResumeRule:
 def _decides(levels: SafeLevels, observation: Observation) -> bool:
     """Whether only a person may clear the fault."""
     return (
-        levels.rung == Rung.VENT
+        levels.safe_level == SafeLevel.VENT
         or bool(observation.board_faults & ~WATCHDOG_MASK)
         or observation.vent_fraction > VENTED_FRACTION
         or bool(observation.locked)

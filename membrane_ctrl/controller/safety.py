@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.safety_rules import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, Observation, Rule
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 _FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
 # One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the film by 0.2 um
@@ -24,7 +24,7 @@ _A_FEW = (3, 3)  # one repeated sample of a busy device is not a fault
 TABLE: tuple[Rule, ...] = (
     Rule(
         code=20, name="over_pressure", cause="gauge pressure above its limit",
-        limit="limits.gauge_pressure_max_pa", rung=Rung.VENT, seen_in=_TWICE, states=ALWAYS,
+        limit="limits.gauge_pressure_max_pa", safe_level=SafeLevel.VENT, seen_in=_TWICE, states=ALWAYS,
         remedy="find what over-filled the mirror before it is inflated again",
         seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
         broken=lambda o, c: o.gauge_pressure_pa > c.gauge_pressure_max_pa,
@@ -32,94 +32,94 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=21, name="over_displacement", cause="the bowl is deeper than its limit",
-        limit="limits.displacement_max_um", rung=Rung.VENT, seen_in=_TWICE, states=ALWAYS,
+        limit="limits.displacement_max_um", safe_level=SafeLevel.VENT, seen_in=_TWICE, states=ALWAYS,
         remedy="check the laser against a ruler, then the setpoint and the limits",
         seen=lambda o: f"{o.depth_um:.1f} um", broken=lambda o, c: o.depth_um > c.displacement_max_um,
         unseen=lambda o: math.isnan(o.depth_um),
     ),
     Rule(
         code=35, name="pump_runs_on", cause="the pump does not stop when it is commanded off",
-        limit="states.lower_timeout_s", rung=Rung.VENT, states=ALWAYS,
+        limit="states.lower_timeout_s", safe_level=SafeLevel.VENT, states=ALWAYS,
         remedy="cut the pump's power or shut its gas; then check its drive and wiring",
         seen=lambda o: o.runs_on, broken=lambda o, c: bool(o.runs_on),
     ),
     Rule(
         code=36, name="gas_comes_in", cause="the mirror rises although the pump is commanded off",
-        limit="30 um in 20 s beyond what the weather explains", rung=Rung.VENT, states=ALWAYS - MOVING,
+        limit="30 um in 20 s beyond what the weather explains", safe_level=SafeLevel.VENT, states=ALWAYS - MOVING,
         remedy="cut the pump's power or shut its gas: its read-back may be wrong, or gas comes another way",
         seen=lambda o: o.inflow, broken=lambda o, c: bool(o.inflow),
     ),
     Rule(
         code=51, name="locked", cause="a person has locked the mirror",
-        limit="ctl ack", rung=Rung.PUMP_OFF, states=CONNECTED | {State.FAULT},
+        limit="ctl ack", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED | {State.FAULT},
         remedy="ask the person who locked it whether the mirror may move",
         seen=lambda o: o.locked, broken=lambda o, c: bool(o.locked),
     ),
     Rule(
         code=50, name="tick_error", cause="the control code raised an error",
-        limit="none may happen", rung=Rung.PUMP_OFF, states=NOT_YET_FAULT,
+        limit="none may happen", safe_level=SafeLevel.PUMP_OFF, states=NOT_YET_FAULT,
         remedy="report it with the run folder",
         seen=lambda o: o.tick_error, broken=lambda o, c: bool(o.tick_error),
     ),
     Rule(
         code=41, name="dead_task", cause="a task of the control process ended",
-        limit="none may end", rung=Rung.PUMP_OFF, states=NOT_YET_FAULT,
+        limit="none may end", safe_level=SafeLevel.PUMP_OFF, states=NOT_YET_FAULT,
         remedy="report it with the run folder",
         seen=lambda o: ", ".join(o.dead_tasks), broken=lambda o, c: bool(o.dead_tasks),
     ),
     Rule(
         code=30, name="link_lost", cause="the link to the pump board is down",
-        limit="must be up", rung=Rung.PUMP_OFF, states=CONNECTED, may_resume=True,
+        limit="must be up", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED, may_resume=True,
         remedy="check cable, power and address; the board's watchdog has stopped the pump",
         broken=lambda o, c: not o.link_up,
     ),
     Rule(
         code=31, name="device_silent", cause="the link is up, but the device did not answer in time",
-        limit="limits.stale_s", rung=Rung.PUMP_OFF, states=CONNECTED, may_resume=True,
+        limit="limits.stale_s", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED, may_resume=True,
         remedy="check the board; its watchdog has stopped the pump",
         seen=lambda o: f"{o.reading_age_s:.2f} s", broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
         code=37, name="board_taken", cause="the board's claim or watchdog is no longer as this run set it",
-        limit="as set by this run", rung=Rung.PUMP_OFF, states=NOT_YET_FAULT,
+        limit="as set by this run", safe_level=SafeLevel.PUMP_OFF, states=NOT_YET_FAULT,
         remedy="find the other program that controls the board, and stop one of the two",
         seen=lambda o: " and ".join(words for bit, words in _FOREIGN.items() if o.foreign & bit),
         broken=lambda o, c: o.foreign != 0,
     ),
     Rule(
         code=32, name="watchdog_tripped", cause="the board's watchdog stopped the pump",
-        limit="must not trip", rung=Rung.PUMP_OFF, states=CONNECTED, may_resume=True,
+        limit="must not trip", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED, may_resume=True,
         remedy="check the lateness in the recording; the machine may be overloaded",
         broken=lambda o, c: o.watchdog_tripped,
     ),
     Rule(
         code=33, name="board_fault", cause="the board has latched a fault",
-        limit="must be 0", rung=Rung.PUMP_OFF, states=CONNECTED,
+        limit="must be 0", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED,
         remedy="read the board's fault bits (docs/registers.md)",
         seen=lambda o: f"bits {o.board_faults:#x}", broken=lambda o, c: o.board_faults != 0,
     ),
     Rule(
         code=34, name="pump_mismatch", cause="the pump's read-back does not follow its command",
-        limit="0.05 of full scale", rung=Rung.PUMP_OFF, seen_in=_FOLLOWED,
+        limit="0.05 of full scale", safe_level=SafeLevel.PUMP_OFF, seen_in=_FOLLOWED,
         remedy="check the pump's drive and its limits on the board",
         broken=lambda o, c: o.pump_mismatch > 0.05,
     ),
     Rule(
         code=12, name="displacement_frozen", cause="the device answers, but its samples do not advance",
-        limit="limits.stale_s", rung=Rung.HOLD_FLOW, may_resume=True,
+        limit="limits.stale_s", safe_level=SafeLevel.HOLD_FLOW, may_resume=True,
         remedy="restart the sensor",
         seen=lambda o: f"{o.advance_age_s:.2f} s", broken=lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
         code=14, name="laser_implausible",
         cause="camera and gauge agree that the laser is wrong",
-        limit="shape.disagreement_max_um", rung=Rung.HOLD_FLOW, states=HOLDING,
+        limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=HOLDING,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
     ),
     Rule(
         code=18, name="laser_gauge_apart", cause="laser and gauge contradict each other",
-        limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um", rung=Rung.RAMP_DOWN,
+        limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um", safe_level=SafeLevel.RAMP_DOWN,
         states=CONNECTED,
         remedy="find which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "
         "sag_mm and pressure_pa",
@@ -127,7 +127,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=16, name="gauge_stuck", cause="the gauge repeats one value to the last bit",
-        limit="limits.gauge_stuck_s", rung=Rung.RAMP_DOWN,
+        limit="limits.gauge_stuck_s", safe_level=SafeLevel.RAMP_DOWN,
         remedy="restart the gauge; if it filters its noise below its own resolution raise limits.gauge_stuck_s",
         seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa for {o.gauge_same_s:.0f} s",
         broken=lambda o, c: o.gauge_same_s > c.gauge_stuck_s, unseen=lambda o: math.isnan(o.gauge_pressure_pa),
@@ -135,38 +135,38 @@ TABLE: tuple[Rule, ...] = (
     Rule(
         code=19, name="gas_excess",
         cause="the film takes far more gas than before, and no camera sees it stand still",
-        limit="limits.leak_growth_max", rung=Rung.RAMP_DOWN, states=HOLDING,
+        limit="limits.leak_growth_max", safe_level=SafeLevel.RAMP_DOWN, states=HOLDING,
         remedy="look for an opening seam, then for a laser that creeps: compare it with a ruler",
         seen=lambda o: o.gas_excess, broken=lambda o, c: bool(o.gas_excess),
     ),
     Rule(
         code=17, name="gauge_jump", cause="the gauge reading jumped further than a film can",
-        limit="limits.gauge_step_max_pa", rung=Rung.HOLD_FLOW, seen_in=(5, 10),
+        limit="limits.gauge_step_max_pa", safe_level=SafeLevel.HOLD_FLOW, seen_in=(5, 10),
         remedy="look at the gauge's hose and plug",
         seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa", broken=lambda o, c: o.gauge_jumps > 0,
     ),
     Rule(
         code=15, name="displacement_stuck", cause="the laser repeats one value to the last bit",
-        limit="limits.stuck_s", rung=Rung.HOLD_FLOW,
+        limit="limits.stuck_s", safe_level=SafeLevel.HOLD_FLOW,
         remedy="restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
         seen=lambda o: f"{o.same_s:.1f} s",
         broken=lambda o, c: o.displacement_valid and o.same_s > c.stuck_s and not o.optics_hold,
     ),
     Rule(
         code=13, name="displacement_jump", cause="the laser reading jumped further than a film can",
-        limit="limits.step_max_um", rung=Rung.HOLD_FLOW, seen_in=(5, 10), may_resume=True,
+        limit="limits.step_max_um", safe_level=SafeLevel.HOLD_FLOW, seen_in=(5, 10), may_resume=True,
         remedy="look for something in the beam or a bumped laser",
         broken=lambda o, c: o.jumps > 0 and not o.optics_hold,
     ),
     Rule(
         code=10, name="displacement_missing", cause="no valid laser reading",
-        limit="3 ticks in a row", rung=Rung.HOLD_FLOW, seen_in=_A_FEW, may_resume=True,
+        limit="3 ticks in a row", safe_level=SafeLevel.HOLD_FLOW, seen_in=_A_FEW, may_resume=True,
         remedy="check the laser's aim and its error code",
         broken=lambda o, c: not o.displacement_valid and not o.optics_hold,
     ),
     Rule(
         code=24, name="pressure_missing", cause="no gauge pressure",
-        limit="every tick", rung=Rung.RAMP_DOWN, seen_in=(10, 10), may_resume=True,
+        limit="every tick", safe_level=SafeLevel.RAMP_DOWN, seen_in=(10, 10), may_resume=True,
         remedy="check the pressure sensor: without it over-pressure is not seen",
         seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
         broken=lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
@@ -174,33 +174,33 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=22, name="under_displacement", cause="the bowl is shallower than its limit",
-        limit="limits.displacement_min_um", rung=Rung.RAMP_DOWN, seen_in=_TWICE, states=HOLDING,
+        limit="limits.displacement_min_um", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE, states=HOLDING,
         remedy="look for a leak or a laser that was moved",
         seen=lambda o: f"{o.depth_um:.1f} um", broken=lambda o, c: o.depth_um < c.displacement_min_um,
         unseen=lambda o: math.isnan(o.depth_um),
     ),
     Rule(
         code=23, name="following_error", cause="the mirror does not follow its setpoint",
-        limit="limits.following_error_max_um", rung=Rung.RAMP_DOWN, seen_in=(100, 100), states=HOLDING,
+        limit="limits.following_error_max_um", safe_level=SafeLevel.RAMP_DOWN, seen_in=(100, 100), states=HOLDING,
         remedy="look for a leak, a stuck pump or a mirror that is too tight",
         seen=lambda o: f"{o.error_um:.1f} um", broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,
         unseen=lambda o: math.isnan(o.error_um),
     ),
     Rule(
         code=25, name="overdue", cause="a state took too long",
-        limit="[states] time-outs", rung=Rung.RAMP_DOWN, states=CONNECTED,
+        limit="[states] time-outs", safe_level=SafeLevel.RAMP_DOWN, states=CONNECTED,
         remedy="check what it waited for; a fill from flat needs states.inflate_timeout_s of hours",
         seen=lambda o: o.overdue, broken=lambda o, c: bool(o.overdue),
     ),
     Rule(
         code=26, name="actuator_test", cause="the film does not respond to pump or vent",
-        limit="pump_obeys.py", rung=Rung.PUMP_OFF, states={State.CHECK},
+        limit="pump_obeys.py", safe_level=SafeLevel.PUMP_OFF, states={State.CHECK},
         remedy="check hoses, valve and pump, and where the laser points",
         seen=lambda o: o.unfit, broken=lambda o, c: bool(o.unfit),
     ),
     Rule(
         code=40, name="late", cause="ticks start too late to control the mirror",
-        limit="limits.lateness_max_ms", rung=Rung.RAMP_DOWN, seen_in=(5, 10), may_resume=True,
+        limit="limits.lateness_max_ms", safe_level=SafeLevel.RAMP_DOWN, seen_in=(5, 10), may_resume=True,
         remedy="move other work off this machine",
         seen=lambda o: f"{o.lateness_ms:.0f} ms", broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
@@ -241,6 +241,6 @@ class SafetyTable:
                 continue
             history = ((self._history[index] << 1) | broken) & ((1 << rule.window) - 1)
             self._history[index] = history
-            if history.bit_count() >= rule.needed and (tripped is None or rule.rung > tripped.rung):
+            if history.bit_count() >= rule.needed and (tripped is None or rule.safe_level > tripped.safe_level):
                 tripped = rule
         return Verdict(tripped, tripped.seen(observation) if tripped else "")

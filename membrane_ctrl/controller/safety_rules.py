@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 HOLDING = frozenset({State.HOLD})
@@ -68,7 +68,7 @@ class Rule:
     name: str
     cause: str
     limit: str
-    rung: Rung
+    safe_level: SafeLevel
     remedy: str
     broken: Callable[[Observation, LimitsConfig], bool]
     seen: Callable[[Observation], str] = lambda o: ""  # the observed value, for the operator
@@ -91,7 +91,7 @@ class Rule:
     @property
     def latching(self) -> bool:
         """Whether the fault stays until acknowledged."""
-        return self.rung > Rung.HOLD_FLOW
+        return self.safe_level > SafeLevel.HOLD_FLOW
 
     def fault(self, seen: str) -> Fault:
         """The event of a tripped rule, with the observed value in words."""
@@ -101,7 +101,7 @@ class Rule:
             cause=self.cause,
             seen=seen,
             limit=self.limit,
-            rung=self.rung.name.lower(),
+            safe_level=self.safe_level.name.lower(),
             latching=self.latching,
             remedy=self.remedy,
         )

@@ -120,7 +120,7 @@ def telemetry_row(
         missed_ticks=inputs.missed_ticks,
         state=state,
         shape_state=shape.state,
-        rung=scene.levels.rung,
+        safe_level=scene.levels.safe_level,
         fault=fault,
         target_um=scene.setpoint_um,
         setpoint_um=out.setpoint_um,

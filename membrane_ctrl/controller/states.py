@@ -12,7 +12,7 @@ from membrane_ctrl.control.experiments.machine import BenchSample, Finished
 from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5
@@ -129,7 +129,7 @@ def tune(scene: Scene) -> State:
     wanted: float | Finished
     if scene.hold_wanted:
         wanted = Finished(False, f"ended by {scene.asked_by}")
-    elif scene.levels.rung != Rung.NONE:
+    elif scene.levels.safe_level != SafeLevel.NONE:
         wanted = Finished(False, "the safety table holds the mean flow")
     else:
         wanted = trial.step(measurement, scene.dt_s)
@@ -174,11 +174,11 @@ def lower(scene: Scene) -> State:
 
 def fault(scene: Scene) -> State:
     """Descend the safe levels, latched; a person clears the fault, or the resume rule once its cause has gone."""
-    rung = scene.levels.step(scene.now_s)
-    scene.why = f"fault: {rung.name.lower().replace('_', ' ')}"
+    safe_level = scene.levels.step(scene.now_s)
+    scene.why = f"fault: {safe_level.name.lower().replace('_', ' ')}"
     scene.hold_wanted = False
-    scene.vent_fraction = float(scene.venting or rung == Rung.VENT)
-    if rung == Rung.RAMP_DOWN:
+    scene.vent_fraction = float(scene.venting or safe_level == SafeLevel.VENT)
+    if safe_level == SafeLevel.RAMP_DOWN:
         if scene.state_age_s == 0:
             scene.ramp_from_fraction = scene.last_pump_fraction
         left = max(0.0, 1.0 - scene.levels.age_s(scene.now_s) / scene.config.states.ramp_down_s)
@@ -195,17 +195,17 @@ def fault(scene: Scene) -> State:
         scene.why = "the cause is gone; resuming automatically"
         return State.STANDBY
     may_end = stops or not (scene.config.states.stay_after_trip or scene.resume_possible)
-    if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, rung)):
+    if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, safe_level)):
         scene.finished = Exit.SAFETY_TRIP
     return State.FAULT
 
 
-def _nothing_left_to_do(scene: Scene, rung: Rung) -> bool:
+def _nothing_left_to_do(scene: Scene, safe_level: SafeLevel) -> bool:
     """Whether, with a pump that does not obey, the vent is open and the mirror empty or given time to empty.
 
     Until then the run continues, so that it keeps commanding the pump to stop.
     """
-    if rung != Rung.VENT:
+    if safe_level != SafeLevel.VENT:
         return False
     reading, vented_s = scene.observer.reading, scene.levels.age_s(scene.now_s)
     empty = reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
@@ -251,7 +251,7 @@ def _strayed(scene: Scene) -> bool:
 def _manual_over(scene: Scene) -> str:
     """Why the loop takes over from manual flow; empty if it does not."""
     states = scene.config.states
-    if scene.levels.rung != Rung.NONE:
+    if scene.levels.safe_level != SafeLevel.NONE:
         return "the safety table holds the mean flow"
     if _strayed(scene):
         return f"more than {states.manual_range_um:g} um from the setpoint"
@@ -315,7 +315,7 @@ def _begin(scene: Scene, leak_um_per_s: float) -> State:
 
 def _drive(scene: Scene, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
-    drive = scene.loop.step if scene.levels.rung == Rung.NONE else scene.loop.stale
+    drive = scene.loop.step if scene.levels.safe_level == SafeLevel.NONE else scene.loop.stale
     output = drive(_given(scene, target_um), scene.dt_s)
     scene.give(output)
     return output
@@ -347,7 +347,7 @@ def _missing(scene: Scene) -> str:
 
 
 def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
-    if scene.levels.rung == Rung.HOLD_FLOW:
+    if scene.levels.safe_level == SafeLevel.HOLD_FLOW:
         return "holding the last mean flow until the laser is back"
     if output.too_tight:
         return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"

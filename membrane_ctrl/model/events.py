@@ -61,7 +61,7 @@ class Fault(Event, kind="fault"):
     cause: str
     seen: str
     limit: str
-    rung: str
+    safe_level: str
     latching: bool
     remedy: str
 
@@ -159,7 +159,7 @@ _SENTENCES = {
     "end": "Run ended: {exit}",
     "state": "State {state}[, from {from}][: {why}]",
     "why": "{why}",
-    "fault": "Fault {name}: {cause}[ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level {rung}]",
+    "fault": "Fault {name}: {cause}[ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level {safe_level}]",
     "cleared": "Fault {name} is over: its cause has gone",
     "resumed": "Fault {name} is cleared by the resume rule",
     "shape": "Shape loop {state}[: {reason}]",

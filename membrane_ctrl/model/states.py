@@ -1,4 +1,4 @@
-"""Names of states and rungs, in one place for code, files and Rerun paths; their order gives their codes."""
+"""Names of states and safe levels, in one place for code, files and Rerun paths; their order gives their codes."""
 
 from enum import IntEnum
 
@@ -26,7 +26,7 @@ class ShapeState(IntEnum):
     SUSPENDED = 3
 
 
-class Rung(IntEnum):
+class SafeLevel(IntEnum):
     """The safe levels, by their names in telemetry; each times out into the next."""
 
     NONE = 0

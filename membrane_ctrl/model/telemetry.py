@@ -1,7 +1,7 @@
 """One row of telemetry per tick, which the recorder stores and the console shows.
 
 A row crosses to the other processes as plain doubles, so that writing it costs the tick a few microseconds.
-Codes (state, shape state, fault, rung) are small integers; their names are in `states.py`.
+Codes (state, shape state, fault, safe level) are small integers; their names are in `states.py`.
 """
 
 import math
@@ -26,7 +26,7 @@ class TelemetryRow:
     missed_ticks: float  # running count
     state: float
     shape_state: float
-    rung: float
+    safe_level: float
     fault: float  # 0: none
     target_um: float  # end of the setpoint ramp
     setpoint_um: float  # setpoint given to the loop, including the trim
@@ -72,6 +72,8 @@ class TelemetryRow:
         return cls(*_STRUCT.unpack(message))
 
 
+# By its name in tables, events, checksums and memories of earlier versions: a field.
+TODAY: dict[str, str] = {"rung": "safe_level"}
 FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")

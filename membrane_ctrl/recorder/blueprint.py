@@ -67,7 +67,13 @@ def _around_band(config: Config, name: str, *paths: str) -> rrb.TimeSeriesView:
 
 
 def _lanes() -> rrb.StateTimelineView:
-    contents = ["+ /state/controller", "+ /state/shape_loop", "+ /state/verdict", "+ /state/rung", "+ /state/fault"]
+    contents = [
+        "+ /state/controller",
+        "+ /state/shape_loop",
+        "+ /state/verdict",
+        "+ /state/safe_level",
+        "+ /state/fault",
+    ]
     return rrb.StateTimelineView(name="States", origin="/state", contents=contents, time_view=_whole_run())
 
 
@@ -233,17 +239,17 @@ SHAPE = Lane(
     streams.WORDS["shape_state"],
     {"off": _CALM, "waiting": _BUSY, "tracking": _GOOD, "suspended": _WARN},
 )
-RUNG = Lane(
-    "/state/rung",
-    "rung",
-    streams.WORDS["rung"],
+SAFE_LEVEL = Lane(
+    "/state/safe_level",
+    "safe_level",
+    streams.WORDS["safe_level"],
     {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
 )
 _FAULTS = streams.WORDS["fault"]
 FAULT = Lane("/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM})
 VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejected": _BAD})
 
-TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, RUNG, FAULT)
+TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, SAFE_LEVEL, FAULT)
 LANES: tuple[Lane, ...] = (*TELEMETRY_LANES, VERDICT)
 
 

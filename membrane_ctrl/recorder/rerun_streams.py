@@ -42,7 +42,7 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
 
 
 # Every tick is recorded around a change of these, and while the error is outside the band.
-_CODES = ("state", "shape_state", "rung", "fault")
+_CODES = ("state", "shape_state", "safe_level", "fault")
 _AFTER_S = 60.0
 _BEFORE_S = 10.0
 

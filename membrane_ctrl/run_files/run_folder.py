@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, files, plain_json, run_events
+from membrane_ctrl.model.telemetry import TODAY
 from membrane_ctrl.run_files.column_file import FOLDER
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
@@ -215,6 +216,7 @@ class LoggedEvent:
 
 def logged(line: events.EventLine) -> LoggedEvent:
     """What a line means; a mark made while the run went on (`ctl mark`) is recorded as a command."""
+    line = {TODAY.get(key, key): value for key, value in line.items()}
     event = run_events.from_dict(line)
     if isinstance(event, events.CommandTaken) and event.command == "mark":
         line = line | {"kind": "mark", "text": event.text or event.why}

@@ -124,7 +124,7 @@ STREAMS: tuple[Stream, ...] = (
             Line("displacement_quality", "displacement quality", RED),
             Line("state", "state", GREEN),
             Line("shape_state", "shape state", VIOLET),
-            Line("rung", "rung", YELLOW),
+            Line("safe_level", "safe level", YELLOW),
             Line("fault", "fault", RED),
         ),
     ),
@@ -247,7 +247,7 @@ def _words(codes: type[IntEnum]) -> dict[int, str]:
 WORDS: dict[str, dict[int, str]] = {
     "state": _words(states.State),
     "shape_state": _words(states.ShapeState),
-    "rung": _words(states.Rung),
+    "safe_level": _words(states.SafeLevel),
     "fault": {0: "none"} | {rule.code: rule.name for rule in safety.TABLE},
 }
 

@@ -272,7 +272,8 @@ def _quantiles(histogram: LogHistogram) -> dict[str, float]:
 # What counts as held: in `hold`, the setpoint ramp at its target, no pause, no fault, and that for some seconds.
 
 FIELDS = (
-    "mono_s", "state", "rung", "setpoint_um", "trim_um", "target_um", "displacement_um", "error_um", "p_um_per_s",
+    "mono_s", "state", "safe_level", "setpoint_um", "trim_um", "target_um", "displacement_um", "error_um",
+    "p_um_per_s",
 )  # fmt: skip
 PARTS = ("held", "faults", "paused", "moving")
 # A mirror that was let go (a pause, a fault's mean flow) may have strayed: it counts again once it has stayed
@@ -296,7 +297,7 @@ class HoldParts:
     def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
         """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
         time_s, hold = block["mono_s"], block["state"] == states.State.HOLD
-        faults = block["rung"] > 0
+        faults = block["safe_level"] > 0
         # a loop that follows its error has a proportional part; a lost reading alone is no pause
         open_loop = (block["p_um_per_s"] == 0) & (block["error_um"] != 0) & np.isfinite(block["displacement_um"])
         paused = hold & ~faults & open_loop

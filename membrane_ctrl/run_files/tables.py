@@ -40,7 +40,7 @@ SIGNALS: tuple[str, ...] = (
     "lateness_ms",
     "missed_ticks",
 )
-CODES: tuple[str, ...] = ("state", "shape_state", "rung", "fault")
+CODES: tuple[str, ...] = ("state", "shape_state", "safe_level", "fault")
 NAMES: tuple[str, ...] = (
     "time_s",
     "rows",

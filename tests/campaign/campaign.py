@@ -30,7 +30,7 @@ from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
 
 from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 SEEDS = range(1, 5)
 _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"
@@ -228,8 +228,8 @@ def write_processes(results: list[ProcessResult]) -> None:
 
 
 def _cell(results: list[Result]) -> str:
-    deepest = max((r.rung for r in results), default=Rung.NONE)
-    if deepest == Rung.NONE:
+    deepest = max((r.safe_level for r in results), default=SafeLevel.NONE)
+    if deepest == SafeLevel.NONE:
         return "-"
     said = ", ".join(sorted({r.said for r in results if r.said}))
     slowest_s = max((r.reaction_s for r in results if not math.isnan(r.reaction_s)), default=math.nan)
@@ -266,7 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
         results, told = run_all(options.processes)
         DOCUMENT.write_text(document(results, told), encoding="utf-8")
     for result in results:
-        came_of = result.violations or ((f"{result.rung.name} {result.said}",) if options.only else ())
+        came_of = result.violations or ((f"{result.safe_level.name} {result.said}",) if options.only else ())
         for what in came_of:
             print(f"{result.case} in {result.situation}, seed {result.seed}: {what}")
     for story in told:

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from campaign_times import GAUGE_STUCK_S, HOLD_FLOW_S, STALE_S, TICK_S
 
 from membrane_ctrl.controller.commands import Kind
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """A lasting fault must have led to `rung` or deeper `within_s` after it began."""
+    """A lasting fault must have led to `safe_level` or deeper `within_s` after it began."""
 
-    rung: Rung
+    safe_level: SafeLevel
     within_s: float
 
 
@@ -93,7 +93,7 @@ class Case:
 
     def reaction(self, state: State) -> Reaction | None:
         """What must follow when it begins while the controller is in `state`."""
-        if self.always is not None and (state != State.FAULT or self.always.rung == Rung.VENT):
+        if self.always is not None and (state != State.FAULT or self.always.safe_level == SafeLevel.VENT):
             return self.always
         if self.holding is not None and state == State.HOLD:
             return self.holding
@@ -106,11 +106,11 @@ def _case(name: str, said: str = "", **rest: object) -> Case:
 
 _LOST = "displacement_missing displacement_frozen overdue"
 _SOON = 4 * TICK_S  # two ticks after a rule with a window of one, and the tick in which the fault begins
-_TESTED = Reaction(Rung.PUMP_OFF, 10.0)  # the actuator test, twice
+_TESTED = Reaction(SafeLevel.PUMP_OFF, 10.0)  # the actuator test, twice
 
 CASES: tuple[Case, ...] = (
     _case("nothing"),
-    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S)),
+    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S)),
     _case("no light for 5 s", _LOST, wrong={"no_light": 1}, for_s=5.0),
     _case(
         "light a fifth of the time",
@@ -118,7 +118,7 @@ CASES: tuple[Case, ...] = (
         wrong={"no_light": 1},
         for_s=1.6,
         every_s=2.0,
-        moving=Reaction(Rung.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of the used budget recover
+        moving=Reaction(SafeLevel.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of the used budget recover
     ),
     _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
     _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
@@ -128,21 +128,21 @@ CASES: tuple[Case, ...] = (
         wrong={"laser_offset_um": -200},
         laser_lies=True,
         believed=True,
-        moving=Reaction(Rung.HOLD_FLOW, 8 * TICK_S),
+        moving=Reaction(SafeLevel.HOLD_FLOW, 8 * TICK_S),
     ),
     _case(
         "laser 600 um too deep",
         "over_displacement",
         wrong={"laser_offset_um": 600},
         laser_lies=True,
-        always=Reaction(Rung.VENT, 5 * TICK_S),
+        always=Reaction(SafeLevel.VENT, 5 * TICK_S),
     ),
     _case(
         "laser stuck",
         f"{_LOST} displacement_stuck actuator_test following_error",
         wrong={"laser_stuck": 1},
         laser_lies=True,
-        moving=Reaction(Rung.HOLD_FLOW, 5.0 + _SOON),
+        moving=Reaction(SafeLevel.HOLD_FLOW, 5.0 + _SOON),
     ),
     _case(
         "board repeats its sample",
@@ -150,28 +150,28 @@ CASES: tuple[Case, ...] = (
         wrong={"samples_frozen": 1},
         laser_lies=True,
         gauge_lies=True,
-        moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S),
+        moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S),
     ),
     _case(
         "gauge lost",
         "pressure_missing overdue",
         wrong={"gauge_lost": 1},
         gauge_lies=True,
-        moving=Reaction(Rung.RAMP_DOWN, 13 * TICK_S),
+        moving=Reaction(SafeLevel.RAMP_DOWN, 13 * TICK_S),
     ),
     _case(
         "gauge reads too much",
         "over_pressure",
         wrong={"gauge_offset_pa": 100},
         gauge_lies=True,
-        always=Reaction(Rung.VENT, 5 * TICK_S),
+        always=Reaction(SafeLevel.VENT, 5 * TICK_S),
     ),
     _case(
         "gauge reads above the board's limit",
         "over_pressure board_fault",
         wrong={"gauge_offset_pa": 300},
         gauge_lies=True,
-        always=Reaction(Rung.VENT, 5 * TICK_S),
+        always=Reaction(SafeLevel.VENT, 5 * TICK_S),
     ),
     _case(
         "gauge above the board's limit for one sample",
@@ -179,14 +179,14 @@ CASES: tuple[Case, ...] = (
         wrong={"gauge_offset_pa": 300},
         for_s=TICK_S,
         gauge_lies=True,
-        moving=Reaction(Rung.PUMP_OFF, _SOON),
+        moving=Reaction(SafeLevel.PUMP_OFF, _SOON),
     ),
     _case(
         "gauge reads too little",
         "gauge_jump laser_gauge_apart",
         wrong={"gauge_offset_pa": -100},
         gauge_lies=True,
-        moving=Reaction(Rung.HOLD_FLOW, 8 * TICK_S),
+        moving=Reaction(SafeLevel.HOLD_FLOW, 8 * TICK_S),
         believed=True,
     ),
     _case(
@@ -194,7 +194,7 @@ CASES: tuple[Case, ...] = (
         "gauge_stuck laser_gauge_apart",
         wrong={"gauge_stuck": 1},
         gauge_lies=True,
-        moving=Reaction(Rung.RAMP_DOWN, GAUGE_STUCK_S + _SOON),
+        moving=Reaction(SafeLevel.RAMP_DOWN, GAUGE_STUCK_S + _SOON),
     ),
     _case("barometer lost", wrong={"barometer_lost": 1}),
     _case("thermometer lost", wrong={"thermometer_lost": 1}),
@@ -202,8 +202,8 @@ CASES: tuple[Case, ...] = (
         "no answers",
         "device_silent displacement_missing overdue",
         wrong={"silent": 1},
-        moving=Reaction(Rung.PUMP_OFF, STALE_S + _SOON),
-        checking=Reaction(Rung.PUMP_OFF, STALE_S + _SOON),
+        moving=Reaction(SafeLevel.PUMP_OFF, STALE_S + _SOON),
+        checking=Reaction(SafeLevel.PUMP_OFF, STALE_S + _SOON),
     ),
     _case("no answers for 0.2 s", "displacement_missing", wrong={"silent": 1}, for_s=0.2),
     _case("every 15th answer lost", wrong={"lost_every": 15}),
@@ -212,8 +212,8 @@ CASES: tuple[Case, ...] = (
         "network cut",
         "link_lost",
         wrong={"unreachable": 1},
-        moving=Reaction(Rung.PUMP_OFF, _SOON),
-        checking=Reaction(Rung.PUMP_OFF, _SOON),
+        moving=Reaction(SafeLevel.PUMP_OFF, _SOON),
+        checking=Reaction(SafeLevel.PUMP_OFF, _SOON),
     ),
     _case("network cut for 0.1 s", "link_lost", wrong={"unreachable": 1}, for_s=0.1),
     _case(
@@ -231,13 +231,13 @@ CASES: tuple[Case, ...] = (
         "pump's read-back stays at 1",
         "pump_mismatch pump_runs_on",
         wrong={"readback_fraction": 1.0},
-        moving=Reaction(Rung.PUMP_OFF, 8.0),  # the command itself may be near 1 while the mirror rises
+        moving=Reaction(SafeLevel.PUMP_OFF, 8.0),  # the command itself may be near 1 while the mirror rises
     ),
     _case(
         "pump gives nothing",
         "following_error actuator_test under_displacement",
         wrong={"pump_share": 0.0},
-        holding=Reaction(Rung.RAMP_DOWN, 40.0),
+        holding=Reaction(SafeLevel.RAMP_DOWN, 40.0),
         checking=_TESTED,
     ),
     _case("pump gives 60 %", "", wrong={"pump_share": 0.6}),
@@ -245,7 +245,7 @@ CASES: tuple[Case, ...] = (
         "pump runs at full",
         "over_displacement over_pressure gas_comes_in following_error actuator_test",
         wrong={"pump_stuck_fraction": 1.0},
-        moving=Reaction(Rung.RAMP_DOWN, 25.0),
+        moving=Reaction(SafeLevel.RAMP_DOWN, 25.0),
     ),
     _case(
         "pump stays at 0.5",
@@ -256,7 +256,7 @@ CASES: tuple[Case, ...] = (
         "vent stays open",
         f"{_LOST} following_error under_displacement displacement_jump actuator_test",
         wrong={"vent_stuck_fraction": 1.0},
-        holding=Reaction(Rung.RAMP_DOWN, 2.0),
+        holding=Reaction(SafeLevel.RAMP_DOWN, 2.0),
     ),
     _case("vent stays shut", "actuator_test", wrong={"vent_stuck_fraction": 0.0}, checking=_TESTED),
     _case("process stopped for 0.2 s", "late", wrong={"stalled": 1}, for_s=0.2),
@@ -271,10 +271,10 @@ CASES: tuple[Case, ...] = (
         "ticks 150 ms late",
         "late",
         wrong={"late_ms": 150},
-        moving=Reaction(Rung.RAMP_DOWN, 8 * TICK_S),
+        moving=Reaction(SafeLevel.RAMP_DOWN, 8 * TICK_S),
     ),
-    _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(Rung.PUMP_OFF, _SOON)),
-    _case("control code raises", "tick_error", raises=True, always=Reaction(Rung.PUMP_OFF, _SOON)),
+    _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
+    _case("control code raises", "tick_error", raises=True, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
     _case("camera lost", wrong={"camera_lost": 1}),
     _case("camera sees 30 um too much", wrong={"camera_offset_um": 30.0}),
     _case("leak ten times", "following_error under_displacement actuator_test", leak_factor=10.0),
@@ -285,13 +285,13 @@ CASES: tuple[Case, ...] = (
         f"{_LOST} pressure_missing",
         wrong={"no_light": 1, "gauge_lost": 1},
         gauge_lies=True,
-        moving=Reaction(Rung.RAMP_DOWN, 13 * TICK_S),
+        moving=Reaction(SafeLevel.RAMP_DOWN, 13 * TICK_S),
     ),
     _case(
         "laser lost while the pump runs at full",
         f"{_LOST} over_pressure over_displacement following_error actuator_test gas_comes_in",
         wrong={"no_light": 1, "pump_stuck_fraction": 1.0},
-        moving=Reaction(Rung.HOLD_FLOW, 6 * TICK_S),
+        moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S),
     ),
     _case(
         "process stopped while the laser is lost",
@@ -303,7 +303,7 @@ CASES: tuple[Case, ...] = (
         "no answers and late",
         f"{_LOST} device_silent late",
         wrong={"silent": 1, "late_ms": 150},
-        moving=Reaction(Rung.RAMP_DOWN, STALE_S + _SOON),
+        moving=Reaction(SafeLevel.RAMP_DOWN, STALE_S + _SOON),
     ),
 )
 

@@ -38,7 +38,7 @@ from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
@@ -62,7 +62,7 @@ class Result:
     situation: str
     seed: int
     said: str
-    rung: Rung
+    safe_level: SafeLevel
     reaction_s: float
     violations: tuple[str, ...]
     tripped: tuple[str, ...] = ()

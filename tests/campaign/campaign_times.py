@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from membrane_ctrl.model.states import Rung
+from membrane_ctrl.model.states import SafeLevel
 
 RATE_HZ = 25.0
 TICK_S = 1 / RATE_HZ
@@ -14,12 +14,17 @@ BOARD_PRESSURE_MAX_PA = 800.0
 RESUME_WAIT_S = 3.0
 RESUMES_A_DAY = 2
 # after a lasting fault enters on a safe level, the pump must stop and the vent open within these times
-OFF_AFTER_S = {Rung.HOLD_FLOW: HOLD_FLOW_S + RAMP_S, Rung.RAMP_DOWN: RAMP_S, Rung.PUMP_OFF: 0.0, Rung.VENT: 0.0}
+OFF_AFTER_S = {
+    SafeLevel.HOLD_FLOW: HOLD_FLOW_S + RAMP_S,
+    SafeLevel.RAMP_DOWN: RAMP_S,
+    SafeLevel.PUMP_OFF: 0.0,
+    SafeLevel.VENT: 0.0,
+}
 VENTS_AFTER_S = {
-    Rung.HOLD_FLOW: HOLD_FLOW_S + RAMP_S + PUMP_OFF_S,
-    Rung.RAMP_DOWN: RAMP_S + PUMP_OFF_S,
-    Rung.PUMP_OFF: PUMP_OFF_S,
-    Rung.VENT: 0.0,
+    SafeLevel.HOLD_FLOW: HOLD_FLOW_S + RAMP_S + PUMP_OFF_S,
+    SafeLevel.RAMP_DOWN: RAMP_S + PUMP_OFF_S,
+    SafeLevel.PUMP_OFF: PUMP_OFF_S,
+    SafeLevel.VENT: 0.0,
 }
 # limits near the setpoint, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
 DISPLACEMENT_MIN_UM, DISPLACEMENT_MAX_UM = -80.0, 40.0

@@ -29,7 +29,7 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _STILL = {State.STANDBY, State.LOWER}
@@ -53,9 +53,9 @@ class Watch:
     state : State
     code : float
         Of the first fault since the injection.
-    deepest : Rung
+    deepest : SafeLevel
     reaction_s : float
-        From the injection to the first safe rung.
+        From the injection to the first safe level.
     wrong_s : float
         When the fault was there last.
     """
@@ -68,7 +68,7 @@ class Watch:
         self._gauge_max_pa, self._tick_s, self._resumes = gauge_max_pa, tick_s, resumes
         self._begun_s = math.nan
         self._state_then = State.STANDBY
-        self._rung = Rung.NONE
+        self._safe_level = SafeLevel.NONE
         self._last_tick_s = 0.0
         self._fault_code = 0.0
         self._fault_s = self._blind_s = math.nan
@@ -82,7 +82,7 @@ class Watch:
         self.violations: list[str] = []
         self.state = State.STANDBY
         self.code = 0.0
-        self.deepest = Rung.NONE
+        self.deepest = SafeLevel.NONE
         self.reaction_s = math.nan
 
     def begins(self, now_s: float) -> None:
@@ -104,7 +104,7 @@ class Watch:
         """Check at the end of the aftermath, before any command."""
         reaction = self._case.reaction(self._state_then)
         if reaction is not None and not self._met and "stalled" not in self._case.wrong:
-            self._say(now_s, f"never came to {reaction.rung.name}; got to {self.deepest.name}")
+            self._say(now_s, f"never came to {reaction.safe_level.name}; got to {self.deepest.name}")
         if self._case.harmless and self._at.held and not self._case.lies:
             off_um = self._plant.truth().displacement_um - self._at.target_um
             if abs(off_um) > _HELD_UM:
@@ -148,7 +148,7 @@ class Watch:
 
     def _look_at_tick(self, tick: VirtualTick, now_s: float) -> None:
         row, before = tick.row, self.state
-        self.state, rung = State(int(row.state)), Rung(int(row.rung))
+        self.state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
         for event in tick.events:
             if isinstance(event, Fault):
                 self.names[float(event.code)] = event.name
@@ -156,15 +156,19 @@ class Watch:
                 self._say(now_s, f"an event of kind {event.kind} is too long to be recorded")
         if not (0.0 <= row.pump_fraction <= 1.0 and 0.0 <= row.vent_fraction <= 1.0):
             self._say(now_s, f"wrote pump {row.pump_fraction} and vent {row.vent_fraction}")
-        if rung < self._rung and self._rung > Rung.HOLD_FLOW and self.state == before == State.FAULT:
-            self._say(now_s, f"went up from {self._rung.name} to {rung.name}")
-        if (rung > Rung.HOLD_FLOW) != (self.state == State.FAULT):
-            self._say(now_s, f"{rung.name} in {self.state.name}")
-        if (row.fault == 0) != (rung == Rung.NONE):
-            self._say(now_s, f"{rung.name} with fault code {row.fault:g}")
+        if (
+            safe_level < self._safe_level
+            and self._safe_level > SafeLevel.HOLD_FLOW
+            and self.state == before == State.FAULT
+        ):
+            self._say(now_s, f"went up from {self._safe_level.name} to {safe_level.name}")
+        if (safe_level > SafeLevel.HOLD_FLOW) != (self.state == State.FAULT):
+            self._say(now_s, f"{safe_level.name} in {self.state.name}")
+        if (row.fault == 0) != (safe_level == SafeLevel.NONE):
+            self._say(now_s, f"{safe_level.name} with fault code {row.fault:g}")
         self._look_at_fault(before, row.fault, now_s)
-        self._rung = rung
-        self.deepest = max(self.deepest, rung)
+        self._safe_level = safe_level
+        self.deepest = max(self.deepest, safe_level)
         if not self.code and not math.isnan(self._begun_s):
             self.code = row.fault
 
@@ -235,13 +239,15 @@ class Watch:
         """The pump is off where it must be, stops in time, and the vent opens in time."""
         given, wrong = self._plant.pump_given, self._bench.wrong
         reached = not (wrong.unreachable or wrong.stalled) and now_s == self._last_tick_s
-        self._still_ticks = self._still_ticks + 1 if self.state in _STILL or self._rung >= Rung.PUMP_OFF else 0
+        self._still_ticks = (
+            self._still_ticks + 1 if self.state in _STILL or self._safe_level >= SafeLevel.PUMP_OFF else 0
+        )
         self._look_at_mean_flow(reached, now_s)
         raised = self._case.raises and self._state_then != State.FAULT and now_s > self._begun_s
         if raised and given > 0:
             self._say(now_s, "the code has raised, and the pump is driven")
         if self._obeys and reached and self._still_ticks > 2 and given > 0:
-            self._say(now_s, f"the pump is driven with {given:.2f} on {self._rung.name}")
+            self._say(now_s, f"the pump is driven with {given:.2f} on {self._safe_level.name}")
         blind_s = 0.0 if math.isnan(self._blind_s) else now_s - self._blind_s
         if blind_s > HOLD_FLOW_S + RAMP_S + _SLACK_S and self._obeys and given > 0 and not wrong.stalled:
             self._say(now_s, f"blind for {blind_s:.1f} s and the pump runs")
@@ -251,11 +257,13 @@ class Watch:
         ramp = self._fault_pump * max(0.0, 1.0 - (age_s - 2 * self._tick_s) / RAMP_S)
         if self._obeys and reached and given > ramp + 1e-3:
             self._say(now_s, f"{age_s:.1f} s in the fault the pump is driven with {given:.2f}")
-        self._look_at_vent(age_s > RAMP_S + PUMP_OFF_S + _SLACK_S or self._rung == Rung.VENT, reached, now_s)
+        self._look_at_vent(
+            age_s > RAMP_S + PUMP_OFF_S + _SLACK_S or self._safe_level == SafeLevel.VENT, reached, now_s
+        )
 
     def _look_at_mean_flow(self, reached: bool, now_s: float) -> None:
         """On HOLD_FLOW the pump gives its mean flow: after a second for the rate limit, it is steady."""
-        steady = self._rung == Rung.HOLD_FLOW and self._obeys and reached
+        steady = self._safe_level == SafeLevel.HOLD_FLOW and self._obeys and reached
         self._held_ticks = self._held_ticks + 1 if steady else 0
         if self._held_ticks * self._tick_s < 1.0:
             self._held_pump = self._plant.pump_given
@@ -265,12 +273,12 @@ class Watch:
     def _look_at_vent(self, must_be_open: bool, reached: bool, now_s: float) -> None:
         stuck = not math.isnan(self._bench.wrong.vent_stuck_fraction)
         if must_be_open and reached and not stuck and self._plant.vent_given < 1:
-            self._say(now_s, f"the vent is shut on {self._rung.name}")
+            self._say(now_s, f"the vent is shut on {self._safe_level.name}")
 
     def _look_at_reaction(self, now_s: float) -> None:
         if math.isnan(self._begun_s):
             return
-        if self._rung > Rung.NONE and math.isnan(self.reaction_s):
+        if self._safe_level > SafeLevel.NONE and math.isnan(self.reaction_s):
             self.reaction_s = now_s - self._begun_s
         reaction = self._case.reaction(self._state_then)
         if reaction is None or "stalled" in self._case.wrong:
@@ -278,14 +286,17 @@ class Watch:
         age_s = now_s - self._begun_s - reaction.within_s
         if self._bench.wrong.unreachable:
             age_s -= WATCHDOG_S  # which stops the pump
-        if not self._met and self._rung >= reaction.rung:
+        if not self._met and self._safe_level >= reaction.safe_level:
             self._met = True
         elif not self._met and now_s - self._begun_s > reaction.within_s + 1e-9:
             self._met = True  # report it once
-            self._say(now_s, f"on {self._rung.name}, not on {reaction.rung.name} {reaction.within_s:.2f} s after")
+            self._say(
+                now_s,
+                f"on {self._safe_level.name}, not on {reaction.safe_level.name} {reaction.within_s:.2f} s after",
+            )
         if not self._case.lasting:
             return
-        if age_s > OFF_AFTER_S[reaction.rung] + _SLACK_S and self._obeys and self._plant.pump_given > 0:
-            self._say(now_s, f"the pump runs {age_s:.1f} s after it had to be on {reaction.rung.name}")
+        if age_s > OFF_AFTER_S[reaction.safe_level] + _SLACK_S and self._obeys and self._plant.pump_given > 0:
+            self._say(now_s, f"the pump runs {age_s:.1f} s after it had to be on {reaction.safe_level.name}")
         reached = not self._bench.wrong.unreachable and now_s == self._last_tick_s
-        self._look_at_vent(age_s > VENTS_AFTER_S[reaction.rung] + _SLACK_S, reached, now_s)
+        self._look_at_vent(age_s > VENTS_AFTER_S[reaction.safe_level] + _SLACK_S, reached, now_s)

@@ -21,7 +21,7 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
@@ -326,7 +326,7 @@ class _Watch:
         self._pressure_pa = max(self._pressure_pa, truth.gauge_pressure_pa)
         setpoint_um = row.target_um
         self._pumped_um = max(self._pumped_um, truth.displacement_um - max(setpoint_um, 0.0))
-        if self._state == State.HOLD and row.rung == Rung.NONE:
+        if self._state == State.HOLD and row.safe_level == SafeLevel.NONE:
             off_um = truth.displacement_um - row.setpoint_um + row.trim_um
             self._astray_um = max(self._astray_um, abs(off_um))
         for name in filter(None, map(_speaks, told)):

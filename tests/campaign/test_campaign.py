@@ -12,7 +12,7 @@ from campaign_run import run_case
 
 from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 
 def case_called(name: str) -> Case:
@@ -58,9 +58,9 @@ def test_the_watch_sees_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) ->
         assert run_case(case_called(name), at("hold"), 1).violations, name
 
 
-def test_the_watch_sees_a_ladder_that_stays_on_its_first_rung(monkeypatch: pytest.MonkeyPatch) -> None:
-    def stay(self: SafeLevels, rung: Rung, now_s: float) -> None:
-        self.rung = Rung.HOLD_FLOW
+def test_the_watch_sees_safe_levels_that_stay_on_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stay(self: SafeLevels, safe_level: SafeLevel, now_s: float) -> None:
+        self.safe_level = SafeLevel.HOLD_FLOW
 
     monkeypatch.setattr(SafeLevels, "enter", stay)
     for name in ("network cut", "gauge lost", "pump runs at full"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.model.states import SafeLevel, ShapeState, State
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 RATE_HZ = 50.0
@@ -25,7 +25,7 @@ HOLDING = replace(
     missed_ticks=0.0,
     state=State.HOLD,
     shape_state=ShapeState.TRACKING,
-    rung=Rung.NONE,
+    safe_level=SafeLevel.NONE,
     fault=0.0,
     target_um=0.0,
     setpoint_um=0.12,
@@ -108,7 +108,7 @@ FAULT = {
     "cause": "the link to the pump board is down",
     "seen": "link down",
     "limit": "must be up",
-    "rung": "pump_off",
+    "safe_level": "pump_off",
     "latching": True,
     "remedy": "check cable, power and address; the board's watchdog has stopped the pump",
 }

@@ -10,7 +10,7 @@ from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, text
-from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.model.states import SafeLevel, ShapeState, State
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S
 
 
@@ -81,7 +81,7 @@ def test_silent_control_loop_is_seen() -> None:
 
 def test_fault_stands_until_it_is_cleared_and_is_counted() -> None:
     given = model()
-    given.take_row(replace(HOLDING, rung=Rung.HOLD_FLOW, fault=30.0))
+    given.take_row(replace(HOLDING, safe_level=SafeLevel.HOLD_FLOW, fault=30.0))
     given.take_event(event(0.0, "fault", **FAULT))
     view = given.view(0.0)
     assert view.fault == "link lost: the link to the pump board is down (link down)"

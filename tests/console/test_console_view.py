@@ -15,7 +15,7 @@ from membrane_ctrl.console.model import ConsoleModel, event_line
 from membrane_ctrl.console.process import at_once, line
 from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import duration, number, percent
-from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.model.states import SafeLevel, ShapeState, State
 
 CONFIG = Config()
 
@@ -71,7 +71,7 @@ def everything_wrong() -> ConsoleModel:
     )
     model.take_shape(shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad"))
     model.take_event(event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20))
-    row = replace(HOLDING, state=State.FAULT, shape_state=ShapeState.SUSPENDED, rung=Rung.VENT, fault=30.0)
+    row = replace(HOLDING, state=State.FAULT, shape_state=ShapeState.SUSPENDED, safe_level=SafeLevel.VENT, fault=30.0)
     model.take_row(replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1))
     return model
 
@@ -163,7 +163,9 @@ def test_silence_is_the_headline() -> None:
 def test_before_the_first_tick_and_with_nothing_known() -> None:
     assert any("waiting for the first tick" in row for row in drawn(ConsoleModel(CONFIG)))
     model = ConsoleModel(CONFIG)
-    model.take_row(replace(NOTHING, mono_s=0.0, tick=1.0, missed_ticks=0.0, state=0.0, shape_state=0.0, rung=0.0))
+    model.take_row(
+        replace(NOTHING, mono_s=0.0, tick=1.0, missed_ticks=0.0, state=0.0, shape_state=0.0, safe_level=0.0)
+    )
     assert not any("nan" in row for row in drawn(model))
     assert "nan" not in line(model.view(0.0))
 

@@ -10,7 +10,7 @@ from console_feed import HOLDING
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import holders, why
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.model.telemetry import TelemetryRow
 
 CONFIG = Config()
@@ -50,10 +50,10 @@ def test_outside_the_band_says_which_way_and_what_is_done() -> None:
     assert line(error_um=2.0) == line(error_um=0.0)  # the edge is inside
 
 
-def test_ladder_names_its_fault() -> None:
-    assert line(rung=Rung.VENT, fault="over pressure") == "pump is off and the vent is open: over pressure"
-    assert line(rung=Rung.HOLD_FLOW, told="laser is back soon").endswith("laser is back soon")
-    assert line(rung=Rung.PUMP_OFF) == "pump is off: unknown fault"
+def test_a_safe_level_names_its_fault() -> None:
+    assert line(safe_level=SafeLevel.VENT, fault="over pressure") == "pump is off and the vent is open: over pressure"
+    assert line(safe_level=SafeLevel.HOLD_FLOW, told="laser is back soon").endswith("laser is back soon")
+    assert line(safe_level=SafeLevel.PUMP_OFF) == "pump is off: unknown fault"
 
 
 def test_without_a_reading_the_pump_keeps_its_flow() -> None:
@@ -69,9 +69,9 @@ def test_other_states_say_what_the_controller_told_or_what_is_always_true(state:
 
 
 @pytest.mark.parametrize("state", State)
-@pytest.mark.parametrize("rung", Rung)
-def test_there_is_always_a_line(state: State, rung: Rung) -> None:
-    empty = replace(TelemetryRow(*[math.nan] * 35), state=state, rung=rung, flow_um_per_s=0.0)
+@pytest.mark.parametrize("safe_level", SafeLevel)
+def test_there_is_always_a_line(state: State, safe_level: SafeLevel) -> None:
+    empty = replace(TelemetryRow(*[math.nan] * 35), state=state, safe_level=safe_level, flow_um_per_s=0.0)
     said = why(empty, "", "", CONFIG)
     assert "pump" in said
     assert "nan" not in said

@@ -19,7 +19,7 @@ from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 DT_S = 0.1
 CONFIG = Config(
@@ -166,7 +166,7 @@ def test_a_latch_ends_a_ramp_down_at_once() -> None:
     for _ in range(12):
         mirror.tick(gauge_pressure_pa=math.nan)
     assert mirror.last is not None
-    assert mirror.last.row.rung == Rung.RAMP_DOWN
+    assert mirror.last.row.safe_level == SafeLevel.RAMP_DOWN
     assert mirror.last.command.pump_fraction > 0.0
     assert mirror.tick("latch").command.pump_fraction == 0.0
 

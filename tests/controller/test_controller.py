@@ -17,7 +17,7 @@ from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import EventLine, Why
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_record import run_virtual
@@ -125,44 +125,44 @@ def test_a_repeated_sample_or_two_are_no_fault() -> None:
     assert run.finished == Exit.DONE
 
 
-def test_a_laser_that_stays_away_leads_down_the_ladder() -> None:
+def test_a_laser_that_stays_away_leads_down_the_safe_levels() -> None:
     lost = after(25.0, math.inf, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1))
     config = CALM.model_copy(update={"states": StatesConfig(hold_flow_max_s=2.0, ramp_down_s=3.0)})
     run = Run(config, 60.0, lost)
     assert run.finished == Exit.SAFETY_TRIP
-    rungs = [Rung(rung) for rung in dict.fromkeys(run.value("rung"))]
-    assert rungs == [Rung.NONE, Rung.HOLD_FLOW, Rung.RAMP_DOWN, Rung.PUMP_OFF]
-    ramp = run.value("pump_fraction")[run.value("rung") == Rung.RAMP_DOWN]
+    safe_levels = [SafeLevel(safe_level) for safe_level in dict.fromkeys(run.value("safe_level"))]
+    assert safe_levels == [SafeLevel.NONE, SafeLevel.HOLD_FLOW, SafeLevel.RAMP_DOWN, SafeLevel.PUMP_OFF]
+    ramp = run.value("pump_fraction")[run.value("safe_level") == SafeLevel.RAMP_DOWN]
     assert np.all(np.diff(ramp) <= 0)
     assert run.rows[-1].pump_fraction == 0.0
     assert [f["name"] for f in run.of("fault")] == ["displacement_missing"]  # the first cause, once
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "rung"),
+    ("name", "change", "safe_level"),
     [
-        ("over_pressure", lambda r: replace(r, gauge_pressure_pa=900.0), Rung.VENT),
-        ("over_displacement", lambda r: replace(r, displacement_um=600.0), Rung.VENT),
-        ("device_silent", lambda r: None, Rung.PUMP_OFF),
-        ("watchdog_tripped", lambda r: replace(r, watchdog_tripped=True), Rung.PUMP_OFF),
-        ("board_fault", lambda r: replace(r, latched_faults=2), Rung.PUMP_OFF),
-        ("pump_mismatch", lambda r: replace(r, pump_fraction=0.9), Rung.PUMP_OFF),
-        ("pressure_missing", lambda r: replace(r, gauge_pressure_pa=math.nan), Rung.RAMP_DOWN),
+        ("over_pressure", lambda r: replace(r, gauge_pressure_pa=900.0), SafeLevel.VENT),
+        ("over_displacement", lambda r: replace(r, displacement_um=600.0), SafeLevel.VENT),
+        ("device_silent", lambda r: None, SafeLevel.PUMP_OFF),
+        ("watchdog_tripped", lambda r: replace(r, watchdog_tripped=True), SafeLevel.PUMP_OFF),
+        ("board_fault", lambda r: replace(r, latched_faults=2), SafeLevel.PUMP_OFF),
+        ("pump_mismatch", lambda r: replace(r, pump_fraction=0.9), SafeLevel.PUMP_OFF),
+        ("pressure_missing", lambda r: replace(r, gauge_pressure_pa=math.nan), SafeLevel.RAMP_DOWN),
     ],
 )
-def test_each_latching_fault_enters_its_rung_within_two_ticks_of_its_window(
-    name: str, change: Callable[[BenchReading], BenchReading | None], rung: Rung
+def test_each_latching_fault_enters_its_safe_level_within_two_ticks_of_its_window(
+    name: str, change: Callable[[BenchReading], BenchReading | None], safe_level: SafeLevel
 ) -> None:
     run = Run(CALM, 60.0, after(25.0, math.inf, change))
     assert run.finished == Exit.SAFETY_TRIP
     latched = [f for f in run.of("fault") if f["latching"]]
     assert [f["name"] for f in latched] == [name]
     fault_s = latched[0]["mono_s"]
-    entered = next(row for row in run.rows if row.rung == rung)
+    entered = next(row for row in run.rows if row.safe_level == safe_level)
     assert entered.mono_s - fault_s <= 0.041
-    if rung >= Rung.PUMP_OFF:
+    if safe_level >= SafeLevel.PUMP_OFF:
         assert entered.pump_fraction == 0.0
-    assert entered.vent_fraction == (1.0 if rung == Rung.VENT else 0.0)
+    assert entered.vent_fraction == (1.0 if safe_level == SafeLevel.VENT else 0.0)
 
 
 def test_a_frozen_sensor_is_seen_although_it_answers() -> None:

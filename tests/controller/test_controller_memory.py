@@ -72,6 +72,12 @@ def test_another_layout_is_refused_by_name() -> None:
         recall(MEMORY, today)
 
 
+def test_a_memory_with_a_field_of_another_name_is_todays() -> None:
+    former = json.dumps(plain(), separators=(",", ":")).replace('"safe_level":', '"rung":')
+    assert '"rung":' in former
+    assert remember(recall(zlib.compress(former.encode()), fresh())) == MEMORY
+
+
 @pytest.mark.parametrize(
     "memory",
     [

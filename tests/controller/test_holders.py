@@ -14,7 +14,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault, HeldBy
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
@@ -88,15 +88,15 @@ def test_without_laser_and_optics_the_flow_is_held_until_one_is_back() -> None:
         wrong.no_light = wrong.camera_lost = fails
 
     ticks = held(fail)
-    rungs = [tick.row.rung for tick in ticks if tick.row.mono_s > FROM_S + 6]
-    assert rungs[0] == Rung.HOLD_FLOW
-    assert rungs[-1] == Rung.NONE
+    safe_levels = [tick.row.safe_level for tick in ticks if tick.row.mono_s > FROM_S + 6]
+    assert safe_levels[0] == SafeLevel.HOLD_FLOW
+    assert safe_levels[-1] == SafeLevel.NONE
 
 
 def test_the_loop_holds_the_laser_as_ever_by_default() -> None:
     ticks = held(set_to("no_light", True), Config(twin=CONFIG.twin), until_s=19.0)
     assert told(ticks) == []
-    assert ticks[-1].row.rung == Rung.HOLD_FLOW
+    assert ticks[-1].row.safe_level == SafeLevel.HOLD_FLOW
 
 
 def test_the_depth_stays_limited_without_a_laser() -> None:

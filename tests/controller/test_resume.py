@@ -14,7 +14,7 @@ from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.scenario import CheckedScenario, Expectation, play
@@ -44,10 +44,12 @@ LOST = replace(GONE, link_up=False)
 class Fault:
     """A fault under the resume rule."""
 
-    def __init__(self, name: str = "link_lost", config: ResumeConfig = CONFIG, rung: Rung = Rung.PUMP_OFF) -> None:
+    def __init__(
+        self, name: str = "link_lost", config: ResumeConfig = CONFIG, safe_level: SafeLevel = SafeLevel.PUMP_OFF
+    ) -> None:
         self.rule = ResumeRule(config, LimitsConfig())
         self.fault, self.levels = RULES[name], SafeLevels(StatesConfig())
-        self.levels.enter(rung, 0.0)
+        self.levels.enter(safe_level, 0.0)
 
     def due(self, now_s: float, observation: Observation = GONE) -> bool:
         return self.rule.due(self.fault, self.levels, observation, now_s)
@@ -95,7 +97,7 @@ def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(seen: 
 
 
 def test_what_has_vented_is_not_possible() -> None:
-    fault = Fault(rung=Rung.VENT)
+    fault = Fault(safe_level=SafeLevel.VENT)
     assert not any(fault.due(float(second)) for second in range(60))
     assert not fault.rule.possible
 

@@ -10,7 +10,7 @@ import pytest
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.safety import TABLE, Observation, Rule, SafetyTable
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 LIMITS = LimitsConfig()
 GOOD = Observation(
@@ -101,7 +101,7 @@ def test_bad_ticks_further_apart_than_the_window_are_nothing(rule: Rule) -> None
 def test_a_state_where_a_rule_does_not_apply_forgets_its_history(rule: Rule) -> None:
     elsewhere = next((s for s in State if s not in rule.states), None)
     if elsewhere is None:
-        assert rule.rung == Rung.VENT  # only venting rules apply in every state
+        assert rule.safe_level == SafeLevel.VENT  # only venting rules apply in every state
         return
     table = judge_alone(rule)
     for _ in range(rule.window * 2):
@@ -122,7 +122,7 @@ def test_not_a_number_is_never_fine() -> None:
     lost = replace(GOOD, displacement_um=math.nan, displacement_valid=False)
     rules = [table.judge(State.HOLD, lost).rule for _ in range(3)]
     assert rules[-1] is not None
-    assert rules[-1].rung == Rung.HOLD_FLOW
+    assert rules[-1].safe_level == SafeLevel.HOLD_FLOW
 
 
 def test_what_the_operator_is_told_carries_the_value() -> None:
@@ -182,7 +182,7 @@ def test_what_must_never_be_passed_opens_the_vent_in_every_state(name: str, stat
     table.judge(state, BAD[name])
     rule = table.judge(state, BAD[name]).rule
     assert rule is not None
-    assert (rule.name, rule.rung) == (name, Rung.VENT)
+    assert (rule.name, rule.safe_level) == (name, SafeLevel.VENT)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -15,7 +15,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety_rules import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 DT_S = 0.1
 CONFIG = Config(
@@ -65,7 +65,7 @@ class Driver:
     def __init__(self, warm: int = 0) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
         self.tick, self.counter, self.pump = 0, 0, 0.0
-        self.rung, self.finished = Rung.NONE, False
+        self.safe_level, self.finished = SafeLevel.NONE, False
         self.fault_pump = math.inf
         self.feed(steady, (Command("hold", "hypothesis"),), True)
         for _ in range(warm):
@@ -104,15 +104,15 @@ class Driver:
 
     def look(self, outputs: TickOutputs, asked: int) -> None:
         row, command = outputs.row, outputs.command
-        state, rung = State(int(row.state)), Rung(int(row.rung))
+        state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
         assert 0.0 <= command.pump_fraction <= 1.0
         assert 0.0 <= command.vent_fraction <= 1.0
         assert command.pump_fraction == 0 or state in MAY_PUMP
-        assert command.pump_fraction == 0 or rung < Rung.PUMP_OFF
-        assert rung != Rung.VENT or command.vent_fraction == 1.0
-        assert (rung > Rung.HOLD_FLOW) == (state == State.FAULT)
-        assert (row.fault != 0) == (rung != Rung.NONE)
-        assert rung >= self.rung or self.rung == Rung.HOLD_FLOW or state == State.STANDBY
+        assert command.pump_fraction == 0 or safe_level < SafeLevel.PUMP_OFF
+        assert safe_level != SafeLevel.VENT or command.vent_fraction == 1.0
+        assert (safe_level > SafeLevel.HOLD_FLOW) == (state == State.FAULT)
+        assert (row.fault != 0) == (safe_level != SafeLevel.NONE)
+        assert safe_level >= self.safe_level or self.safe_level == SafeLevel.HOLD_FLOW or state == State.STANDBY
         if state == State.FAULT:
             assert command.pump_fraction <= self.fault_pump
             self.fault_pump = command.pump_fraction
@@ -124,7 +124,7 @@ class Driver:
         if outputs.finished is not None:
             assert command.pump_fraction == 0
             self.finished = True
-        self.rung, self.pump = rung, command.pump_fraction
+        self.safe_level, self.pump = safe_level, command.pump_fraction
 
 
 @settings(max_examples=120, deadline=None, derandomize=True)

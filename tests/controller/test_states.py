@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from tests.support.scenario import CheckedScenario, Outcome, play
 
 
@@ -329,7 +329,7 @@ def test_a_way_down_stops_the_pump_in_its_first_tick(way: str) -> None:
 def test_readings_that_the_table_distrusts_do_not_drive_the_pump() -> None:
     outcome = played({"time_s": 25.0, "wrong": "laser_stuck"}, limits={"stuck_s": 2.0}, duration_s=38.0)
     held = [tick.row for tick in outcome.ticks if tick.row.state == State.HOLD]
-    distrusted = [row for row in held if row.rung == Rung.HOLD_FLOW]
+    distrusted = [row for row in held if row.safe_level == SafeLevel.HOLD_FLOW]
     assert len(distrusted) > 50
     assert {row.p_um_per_s for row in distrusted} == {0.0}
 

@@ -11,7 +11,7 @@ from membrane_ctrl.model.events import KINDS, EventLine, level, sentence
 
 FAULT = {
     "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 um",
-    "cause": "the bowl is deeper than its limit", "limit": "limits.displacement_max_um", "rung": "vent",
+    "cause": "the bowl is deeper than its limit", "limit": "limits.displacement_max_um", "safe_level": "vent",
     "latching": True, "remedy": "check the laser against a ruler", "crc32": "0",
 }  # fmt: skip
 

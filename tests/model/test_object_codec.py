@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.model.object_codec import CodecError, Decoder, encode
 
 
-class Rung(IntEnum):
+class Level(IntEnum):
     LOW = 0
     HIGH = 1
 
@@ -42,7 +42,7 @@ class Facts:
     pair: tuple[int, float] = (1, math.pi)
     marks: tuple[int, ...] = ()
     names: set[str] = field(default_factory=set)
-    rungs: dict[Rung, float] = field(default_factory=dict)
+    levels: dict[Level, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
     colour: Colour = Colour.RED
     free: list[dict[str, Any]] = field(default_factory=list)
@@ -82,7 +82,7 @@ def full() -> Machine:
         leaf=Leaf(5e-324, "\N{BELL}\N{SNOWMAN}"),
         marks=(1, 2, 3),
         names={"a", "b"},
-        rungs={Rung.HIGH: math.inf},
+        levels={Level.HIGH: math.inf},
         counts={"x": 2**62},
         free=[{"kind": "fault", "deep": [1, {"a": None}]}],
         values=np.random.default_rng(1).normal(size=(3, 2)),
@@ -96,11 +96,11 @@ def full() -> Machine:
 def test_everything_comes_back_to_the_last_bit() -> None:
     machine, again = full(), read(written(full()))
     was, now = machine.facts, again.facts
-    for name in ("leaf", "pair", "marks", "names", "rungs", "counts", "colour", "free", "way"):
+    for name in ("leaf", "pair", "marks", "names", "levels", "counts", "colour", "free", "way"):
         assert getattr(now, name) == getattr(was, name)
         assert type(getattr(now, name)) is type(getattr(was, name))
     assert math.copysign(1.0, now.number) == -1.0
-    assert type(next(iter(now.rungs))) is Rung
+    assert type(next(iter(now.levels))) is Level
     assert now.values.tobytes() == was.values.tobytes()
     assert now.values.shape == (3, 2)
     assert now.values.flags.writeable
@@ -148,10 +148,10 @@ def changed(**values: object) -> Any:
         {"pair": {"0": 1}},
         {"names": "ab"},
         {"names": [["a"]]},
-        {"rungs": [[2, 1.0]]},
-        {"rungs": [["HIGH", 1.0]]},
-        {"rungs": [[1]]},
-        {"rungs": 5},
+        {"levels": [[2, 1.0]]},
+        {"levels": [["HIGH", 1.0]]},
+        {"levels": [[1]]},
+        {"levels": 5},
         {"counts": {"x": "1"}},
         {"colour": "GREEN"},
         {"colour": "__class__"},

@@ -12,10 +12,13 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.events import Fault
 from membrane_ctrl.run_files.inputs_file import open_inputs
+from membrane_ctrl.run_files.run import open_run
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 TICKS = 702
+LOST_S = 24.06  # before-safe-level: the laser
 
 
 def unpacked(name: str, folder: Path) -> Path:
@@ -32,6 +35,11 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def before_columns(tmp_path: Path) -> Path:
     return unpacked("20261122T151047Z-before-columns", tmp_path)
+
+
+@pytest.fixture(scope="module")
+def before_safe_level(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return unpacked("20261123T061500Z-before-safe-level", tmp_path_factory.mktemp("runs"))
 
 
 def test_every_tick_shape_and_memory_of_it_is_read(earlier: Path) -> None:
@@ -76,6 +84,25 @@ def test_events_in_other_words_leave_a_run_the_same_to_the_last_bit(
         [],
     )
     assert 0 < report["different"] < 50
+
+
+def test_a_field_of_another_name_is_read_under_todays(before_safe_level: Path) -> None:
+    told = open_run(before_safe_level)
+    (fault,) = (each.event for each in told.log if each.event.kind == "fault")
+    assert isinstance(fault, Fault)
+    assert fault.safe_level == "hold_flow"
+    ticks, level = told.ticks(["safe_level"]), told.overview(1.0)
+    assert set(ticks.column("safe_level").to_pylist()) == {"none", "hold_flow"}
+    assert "hold_flow" in level.column("safe_level").to_pylist()
+    assert "rung" not in {*ticks.column_names, *level.column_names}
+    assert not [note for note in told.notes if "rung" in note or "safe_level" in note]
+
+
+def test_its_checksums_stay_the_same(before_safe_level: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["replay", str(before_safe_level), "--json"]) == Exit.DONE
+    report = json.loads(capsys.readouterr().out)
+    assert (report["verdict"], report["different"]) == ("identical", 0)
+    assert report["ticks"] * 0.02 > LOST_S - report["begin_s"]
 
 
 def test_rows_that_cannot_be_looked_at_are_not_called_the_same(

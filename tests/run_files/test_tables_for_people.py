@@ -11,7 +11,7 @@ import pyarrow.csv
 import pytest
 
 from benchmarks.nights import night
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.export import export
@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows, shapes = night(1, 0.03, "typical", [])
     rows[:300, FIELDS.index("state")] = State.SETTLE
     rows[500:, FIELDS.index("state")] = State.FAULT
-    rows[500:, FIELDS.index("rung")] = Rung.PUMP_OFF
+    rows[500:, FIELDS.index("safe_level")] = SafeLevel.PUMP_OFF
     rows[500:, FIELDS.index("fault")] = 30.0
     rows[600:, FIELDS.index("fault")] = 99.0
     rows[100:200, FIELDS.index("displacement_um")] = np.nan
@@ -41,11 +41,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_codes_are_names(folder: Path) -> None:
     ticks = open_run(folder).ticks()
-    rows = {row: {name: ticks.column(name)[row].as_py() for name in ("state", "shape_state", "rung", "fault")}
+    rows = {row: {name: ticks.column(name)[row].as_py() for name in ("state", "shape_state", "safe_level", "fault")}
             for row in (0, 400, 550, 650)}  # fmt: skip
-    assert rows[0] == {"state": "settle", "shape_state": "tracking", "rung": "none", "fault": "none"}
+    assert rows[0] == {"state": "settle", "shape_state": "tracking", "safe_level": "none", "fault": "none"}
     assert (rows[400]["state"], rows[400]["fault"]) == ("hold", "none")
-    assert rows[550] == {"state": "fault", "shape_state": "tracking", "rung": "pump_off", "fault": "link_lost"}
+    assert rows[550] == {"state": "fault", "shape_state": "tracking", "safe_level": "pump_off", "fault": "link_lost"}
     assert rows[650]["fault"] == "code 99"  # of a later version
 
 

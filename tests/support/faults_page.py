@@ -9,7 +9,7 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.controller.safety_rules import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, Rule
-from membrane_ctrl.model.states import Rung, State
+from membrane_ctrl.model.states import SafeLevel, State
 
 _DOCS = Path(__file__).parents[2] / "docs"
 FAULTS = _DOCS / "faults.md"
@@ -25,11 +25,11 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("hold", HOLDING),
     ("standby, check, lower, fault", ALWAYS - MOVING),
 )
-_RUNGS = {
-    Rung.HOLD_FLOW: "the pump keeps its last mean flow, until the cause is gone",
-    Rung.RAMP_DOWN: "the flow ramps down to zero",
-    Rung.PUMP_OFF: "the pump is off, the leak lowers the mirror",
-    Rung.VENT: "the pump is off, the vent is open",
+_LEVELS = {
+    SafeLevel.HOLD_FLOW: "the pump keeps its last mean flow, until the cause is gone",
+    SafeLevel.RAMP_DOWN: "the flow ramps down to zero",
+    SafeLevel.PUMP_OFF: "the pump is off, the leak lowers the mirror",
+    SafeLevel.VENT: "the pump is off, the vent is open",
 }
 
 
@@ -57,11 +57,14 @@ def faults_page() -> str:
         "|---|---|---|",
     ]
     after = {
-        Rung.HOLD_FLOW: "`states.hold_flow_max_s`; used time recovers at the same rate",
-        Rung.RAMP_DOWN: "`states.ramp_down_s`",
-        Rung.PUMP_OFF: "`states.pump_off_max_s`",
+        SafeLevel.HOLD_FLOW: "`states.hold_flow_max_s`; used time recovers at the same rate",
+        SafeLevel.RAMP_DOWN: "`states.ramp_down_s`",
+        SafeLevel.PUMP_OFF: "`states.pump_off_max_s`",
     }
-    lines += [f"| {rung.name.lower()} | {does} | {after.get(rung, '-')} |" for rung, does in _RUNGS.items()]
+    lines += [
+        f"| {safe_level.name.lower()} | {does} | {after.get(safe_level, '-')} |"
+        for safe_level, does in _LEVELS.items()
+    ]
     lines += [
         "",
         "## Rules",
@@ -84,7 +87,7 @@ def _row(rule: Rule) -> str:
         rule.cause,
         f"{rule.needed} / {rule.window}",
         _limit(rule.limit),
-        rule.rung.name.lower(),
+        rule.safe_level.name.lower(),
         "yes" if rule.latching else "when it times out",
         "yes" if rule.may_resume else "-",
         where,
@@ -107,7 +110,7 @@ def alarms() -> str:
 
 
 def _by_urgency() -> list[Rule]:
-    return sorted(TABLE, key=lambda rule: (-rule.rung, rule.code))
+    return sorted(TABLE, key=lambda rule: (-rule.safe_level, rule.code))
 
 
 def operations_page(text: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.nights import messages_of
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.model.states import Rung, ShapeState, State
+from membrane_ctrl.model.states import SafeLevel, ShapeState, State
 from membrane_ctrl.model.telemetry import TelemetryRow, unpack
 
 RATE_HZ = 50.0
@@ -38,7 +38,7 @@ def _row(k: int, rng: np.random.Generator, truth: bool) -> TelemetryRow:
         "lateness_ms": 1.0 + rng.exponential(0.5),
         "state": float(state),
         "shape_state": float(ShapeState.TRACKING if state is State.HOLD else ShapeState.OFF),
-        "rung": float(Rung.NONE),
+        "safe_level": float(SafeLevel.NONE),
         "target_um": target_um,
         "setpoint_um": target_um + 0.02,
         "trim_um": 0.02,

@@ -54,10 +54,10 @@ def of_run(path: Path, logs: Path) -> Workpiece:
     """Weather of a run's longest undisturbed hold; plant of the newest session, else as the configuration assumes."""
     run = open_run(path)
     loop = run.config.loop
-    names = (*_COLUMNS, "state", "rung", "leak_um_per_s")
+    names = (*_COLUMNS, "state", "safe_level", "leak_um_per_s")
     blocks = list(run.tick_blocks(names))
     columns = {name: np.concatenate([block[name] for block in blocks] or [np.empty(0)]) for name in names}
-    quiet = (columns["state"] == states.State.HOLD) & (columns["rung"] == states.Rung.NONE)
+    quiet = (columns["state"] == states.State.HOLD) & (columns["safe_level"] == states.SafeLevel.NONE)
     part = _longest(quiet, round(_LONGEST_S * loop.rate_hz))
     dt_s = 1.0 / loop.rate_hz
     if (part.stop - part.start) * dt_s < _SHORTEST_S:

@@ -83,7 +83,11 @@ class ReviewBlueprint:
 
     def _lanes(self) -> rrb.StateTimelineView:
         several = len(self.labels) > 1  # there is room for two lanes of each
-        paths = ("/state/controller", "/state/fault", *(() if several else ("/state/shape_loop", "/state/rung")))
+        paths = (
+            "/state/controller",
+            "/state/fault",
+            *(() if several else ("/state/shape_loop", "/state/safe_level")),
+        )
         return rrb.StateTimelineView(
             name="States", origin="/", contents=self._contents(paths), time_view=self._axis()
         )  # fmt: skip
