@@ -16,6 +16,7 @@ import math
 import secrets
 import time
 from dataclasses import dataclass, field
+from functools import cache
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
@@ -285,7 +286,12 @@ class Action:
     @property
     def states(self) -> frozenset[str]:
         """States in which the hold obeys, in lower case; all for `quiet`."""
-        return frozenset(state.name.lower() for state in (ANY if self.do == "quiet" else TABLE[self.do].states))
+        return _states(self.do)
+
+
+@cache  # asked for each button of each viewer
+def _states(do: str) -> frozenset[str]:
+    return frozenset(state.name.lower() for state in (ANY if do == "quiet" else TABLE[cast(Kind, do)].states))
 
 
 STOP = Action("stop", "STOP", "stop_circle")

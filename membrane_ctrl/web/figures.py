@@ -1,12 +1,13 @@
-"""What the page draws: options of the charts, the map of the figure, a run's sparkline. Pure."""
+"""What the page draws, once for all viewers: the history chart, the map of the figure, a run's sparkline."""
 
-import base64
+import asyncio
 import io
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files import shapes
 from membrane_ctrl.web.feed import UNITS, Series
+
+T = TypeVar("T")
 
 REMOVED = {"nothing": 0, "piston, tilt": 3, "piston, tilt, defocus": 4}
 _BAND = {
@@ -24,10 +27,11 @@ _BAND = {
 
 @dataclass(frozen=True, slots=True)
 class MapPicture:
-    """A map as a picture for the page, with its figures in words."""
+    """A map as a picture for the page, with its figures in words, and the terms beside it."""
 
-    url: str  # data URL of a PNG
+    png: bytes
     words: str
+    terms: dict[str, Any]  # options of their chart
 
 
 def chart(signal: str, series: Series, utc: bool, span_s: float) -> dict[str, Any]:
@@ -107,7 +111,23 @@ def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed:
     Image.fromarray(picture).resize((384, 384), Image.Resampling.NEAREST).save(file, "PNG")
     of = "change since the reference" if change else "height above the vertex"
     words = f"{of}: {values.max() - values.min():.3g} um PV, {values.std():.3g} um rms, scale +-{scale_um:.3g} um"
-    return MapPicture("data:image/png;base64," + base64.b64encode(file.getvalue()).decode(), words)
+    return MapPicture(file.getvalue(), f"{figure.verdict}; {words}", terms_chart(figure, reference))
+
+
+class Shared(Generic[T]):
+    """Makes a thing on a thread, once for all who ask for it within its life."""
+
+    def __init__(self, make: Callable[..., T], life_s: float) -> None:
+        self._make, self._life_s = make, life_s
+        self._made: dict[tuple[Hashable, ...], tuple[asyncio.Task[T], float]] = {}
+
+    async def get(self, *key: Hashable) -> T:
+        """What `make` returns, or raises, for these arguments."""
+        now_s = time.monotonic()
+        self._made = {k: made for k, made in self._made.items() if made[1] > now_s or not made[0].done()}
+        if key not in self._made:
+            self._made[key] = asyncio.create_task(asyncio.to_thread(self._make, *key)), now_s + self._life_s
+        return await asyncio.shield(self._made[key][0])  # a viewer who leaves takes it from nobody
 
 
 def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:

@@ -1,18 +1,21 @@
 """The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs before it."""
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Mapping
 from typing import Any
+from urllib.parse import urlencode
 
 from nicegui import ui
 
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
-from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
-from membrane_ctrl.web.panels import alarms_of, fleet_panel, runs_panel, tuning_panel
+from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed
+from membrane_ctrl.web.panels import SharedViews, alarms_of, fleet_panel, fresh, runs_panel, tuning_panel
 
-_LOOK_S = 0.5
+_LOOK_S = 1.0
+_FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
 _FIGURES = (
     ("error", "error_um", "um", 2), ("setpoint", "setpoint_um", "um", 2), ("laser", "displacement_um", "um", 2),
@@ -27,8 +30,8 @@ _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate"
 class WebPage:
     """The elements of a viewer's page, and what it is set to show."""
 
-    def __init__(self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser) -> None:
-        self._feeds, self._hold, self._user = feeds, hold, user
+    def __init__(self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser, views: SharedViews) -> None:
+        self._feeds, self._hold, self._user, self._views = feeds, hold, user, views
         self._feed = feeds[hold]
         self._logs = self._feed.logs
         self._utc = True
@@ -36,6 +39,7 @@ class WebPage:
         self._removed = "nothing"
         self._charted_s = -1e9
         self._drawn: tuple[float, str] = (0.0, "")
+        self._coloured = ""
         self._buttons: list[tuple[ui.button, Action]] = []
 
     def build(self) -> None:
@@ -63,11 +67,13 @@ class WebPage:
                 self._build_now()
             if self._logs is not None:
                 with ui.tab_panel(look_back):
-                    runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
+                    load = runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
+                    tabs.on_value_change(lambda event: load() if event.value == look_back.props["name"] else None)
                 with ui.tab_panel(tune):
-                    tuning_panel(self._logs)
+                    tuning_panel(lambda: self._views.sessions.get(self._hold))
         ui.keyboard(on_key=self._key)
         ui.timer(_LOOK_S, self._look)
+        ui.timer(_LOOK_S, self._draw)
 
     def _build_now(self) -> None:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
@@ -128,29 +134,34 @@ class WebPage:
         setattr(self, name, value)
         self._charted_s, self._drawn = -1e9, (0.0, "")
 
-    async def _look(self) -> None:
-        """Show what is new."""
+    def _look(self) -> None:
+        """Show the state and the events."""
         seen = self._feed.seen
         self._show_status()
         if seen.events != self._shown_events:
-            known = len(self._shown_events) if seen.events[: len(self._shown_events)] == self._shown_events else 0
-            for line in seen.events[known:]:
+            for line in fresh(self._shown_events, seen.events):
                 self._events.push(line)
             self._shown_events = seen.events
+
+    async def _draw(self) -> None:
+        """Show the figure and the history, if they are new; the next look waits for the browser."""
+        seen = self._feed.seen
         if seen.figure is not None and self._drawn != (seen.figure.time_s, self._removed):
             self._drawn = (seen.figure.time_s, self._removed)
-            picture = await asyncio.to_thread(
-                figures.map_picture, seen.figure, seen.reference, figures.REMOVED[self._removed]
-            )
-            self._map.set_source(picture.url)
-            self._map_words.set_text(f"{seen.figure.verdict}; {picture.words}")
+            picture = await self._views.maps.get(self._hold, self._removed, seen.figure.time_s)
+            query = {"hold": self._hold, "removed": self._removed, "time_s": seen.figure.time_s}
+            self._map.set_source(f"/map?{urlencode(query)}")
+            self._map_words.set_text(picture.words)
             self._terms.options.clear()
-            self._terms.options.update(figures.terms_chart(seen.figure, seen.reference))
+            self._terms.options.update(picture.terms)
         span_s = SPANS_S[self._span]
         if time.monotonic() - self._charted_s > _CHART_EVERY_S.get(span_s, 60.0):
             self._charted_s = time.monotonic()
-            series = await asyncio.to_thread(history, self._feed, self._logs, self._signal, span_s)
-            self._chart.run_chart_method("setOption", figures.chart(self._signal, series, self._utc, span_s))
+            query = {"hold": self._hold, "signal": self._signal, "span": self._span, "utc": self._utc}
+            fetched = f"const answer = await fetch('/chart?{urlencode(query)}'); if (answer.ok)"
+            drawn = f"runMethod({self._chart.id}, 'run_chart_method', ['setOption', await answer.json()])"
+            with contextlib.suppress(TimeoutError):
+                await ui.run_javascript(f"{fetched} {drawn}", timeout=_FETCH_S)
 
     def _show_status(self) -> None:
         seen = self._feed.seen
@@ -159,7 +170,10 @@ class WebPage:
         state = "no contact" if silent else str(status.get("state", "-"))
         self._name.set_text(" ".join(part for part in (self._hold, seen.name or "no hold") if part))
         self._state.set_text(state)
-        self._state.props(f"color={'grey' if silent else _COLOURS.get(state, 'warning')}")
+        colour = "grey" if silent else _COLOURS.get(state, "warning")
+        if colour != self._coloured:
+            self._coloured = colour
+            self._state.props(f"color={colour}")
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._alarm.set_text(alarms_of(status))
         for _, field, _, digits in _FIGURES:

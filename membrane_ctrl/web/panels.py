@@ -1,10 +1,12 @@
 """Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""
 
 import asyncio
+import gzip
+import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,10 +20,10 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
-from membrane_ctrl.sessions.live_log import LiveReader
+from membrane_ctrl.sessions.live_log import LiveReader, Progressed
+from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import WebUser, outranks
-from membrane_ctrl.web.feed import HoldFeed
-from membrane_ctrl.web.figures import sparkline
+from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history
 
 _POINTS = 80
 _MOST = 200  # runs in the table, newest first
@@ -95,7 +97,7 @@ def _picture(folder: Path, ended: float | bool) -> str:
     values = level["mean_error_um"]
     if values.size > _POINTS:
         values = np.array([part.mean() for part in np.array_split(values, _POINTS)])
-    return sparkline(values)
+    return figures.sparkline(values)
 
 
 def run_folder(logs: Path, name: str) -> Path | None:
@@ -112,8 +114,8 @@ def report_problem(folder: Path, user: WebUser) -> str:
     return _command("report", str(folder))
 
 
-def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) -> None:
-    """Fill the tab."""
+def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) -> Callable[[], Awaitable[None]]:
+    """Fill the tab; returns what reads the runs anew."""
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in (
@@ -155,7 +157,7 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
         ui.button("Refresh", icon="refresh", on_click=load).props("flat")
         ui.button("Report", icon="description", on_click=report).props("flat")
         ui.button("Open in Rerun", icon="timeline", on_click=review).props("flat")
-    ui.timer(0.1, load, once=True)
+    return load
 
 
 def _cells(line: RunLine, utc: bool) -> dict[str, object]:
@@ -185,47 +187,97 @@ def _command(*arguments: str) -> str:
     return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["it failed"])[-1]
 
 
-def tuning_panel(logs: Path) -> None:
+@dataclass(frozen=True, slots=True)
+class SessionSeen:
+    """The newest tuning session at one moment."""
+
+    name: str
+    done: frozenset[str]  # its steps
+    progress: Progressed
+
+    @property
+    def head(self) -> str:
+        """Where it is, in a line."""
+        step, asks, ended = self.progress.step, self.progress.asks, self.progress.ended
+        words = (step or "begun", asks and f"asks on its terminal: {asks}", ended and f"ended: {ended}")
+        return f"{self.name}: {', '.join(filter(None, words))}"
+
+
+class SessionWatch:
+    """Follows the newest tuning session in a folder of runs, for all viewers."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._reader: LiveReader | None = None
+
+    def look(self) -> SessionSeen | None:
+        """The session now; None if there is none."""
+        try:
+            newest = folders.newest_session(self._logs)
+        except (errors.CommandError, OSError):
+            return None
+        if self._reader is None or self._reader.session != newest.path:
+            self._reader = LiveReader(newest.path)
+        self._reader.read()
+        done = frozenset(step for step in folders.STEPS if newest.done(step))
+        return SessionSeen(newest.path.name, done, self._reader.progress)
+
+
+class SharedViews:
+    """What all viewers of a hold see alike, made once: charts, maps, the tuning session.
+
+    Browsers fetch charts and maps when they are ready, so that none pile up for a slow one.
+    """
+
+    def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
+        self._feeds = feeds
+        self.charts = figures.Shared(self._chart, life_s=1.0)
+        self.maps = figures.Shared(self._map, life_s=60.0)
+        watches = {name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None}
+        self.sessions = figures.Shared(lambda hold: watches[hold].look(), life_s=_LOOK_S)
+
+    def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
+        """Options of the history chart, as JSON in gzip."""
+        feed, span_s = self._feeds[hold], SPANS_S[span]
+        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, span_s)
+        return gzip.compress(json.dumps(options).encode(), 1)
+
+    def _map(self, hold: str, removed: str, _time_s: float) -> figures.MapPicture:
+        """The newest figure less some terms; a figure of another time is another map."""
+        seen = self._feeds[hold].seen
+        assert seen.figure is not None
+        return figures.map_picture(seen.figure, seen.reference, figures.REMOVED[removed])
+
+
+def fresh(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:
+    """The lines of `new` after those of `old`, the first of which may have been dropped meanwhile."""
+    return next(new[len(old) - gone :] for gone in range(len(old) + 1) if old[gone:] == new[: len(old) - gone])
+
+
+def tuning_panel(look: Callable[[], Awaitable[SessionSeen | None]]) -> None:
     """Fill the tab."""
     head = ui.label("No tuning session in this folder.").classes("text-subtitle1")
     steps = ui.row()
     said = ui.log(max_lines=200).classes("w-full h-64")
-    known: dict[str, object] = {"path": None, "reader": None, "said": 0, "step": ""}
+    shown: SessionSeen | None = None
 
-    def look() -> None:
-        newest = _newest(logs)
-        if newest is None:
+    async def show() -> None:
+        nonlocal shown
+        seen, before = await look(), shown
+        if seen is None or seen == before:
             return
-        if known["path"] != newest.path:
-            known.update(path=newest.path, reader=LiveReader(newest.path), said=0)
+        shown = seen
+        head.set_text(seen.head)
+        if before is None or before.name != seen.name:
             said.clear()
-        reader = known["reader"]
-        assert isinstance(reader, LiveReader)
-        reader.read()
-        progress = reader.progress
-        done = {step for step in folders.STEPS if newest.done(step)}
-        head.set_text(
-            f"{newest.path.name}: {progress.step or 'begun'}"
-            + (f", asks on its terminal: {progress.asks}" if progress.asks else "")
-            + (f", ended: {progress.ended}" if progress.ended else "")
-        )
-        for line in progress.said[int(str(known["said"])) :]:
+            before = None
+        for line in fresh(before.progress.said if before else (), seen.progress.said):
             said.push(line)
-        known["said"] = len(progress.said)
-        shown = f"{progress.step} {sorted(done)}"
-        if shown != known["step"]:
-            known["step"] = shown
+        if before is None or (before.done, before.progress.step) != (seen.done, seen.progress.step):
             steps.clear()
             with steps:
                 for step in folders.STEPS:
-                    colour = "positive" if step in done else "info" if step == progress.step else "grey"
+                    colour = "positive" if step in seen.done else "info" if step == seen.progress.step else "grey"
                     ui.badge(step, color=colour)
 
-    ui.timer(_LOOK_S, look)
-
-
-def _newest(logs: Path) -> folders.SessionFolder | None:
-    try:
-        return folders.newest_session(logs)
-    except (errors.CommandError, OSError):
-        return None
+    ui.timer(_LOOK_S, show)

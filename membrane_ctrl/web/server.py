@@ -1,22 +1,29 @@
 """Serves the page with NiceGUI: on localhost with a link, elsewhere with TLS and names."""
 
+import asyncio
+import os
 import sys
 from pathlib import Path
 
 from fastapi import Request
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, Response
 from nicegui import app, ui
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from membrane_ctrl.config.port import LOCAL_HOSTS, WebConfig
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
-from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.web.feed import SIGNALS, SPANS_S, HoldFeed
+from membrane_ctrl.web.figures import REMOVED
 from membrane_ctrl.web.page import WebPage
-from membrane_ctrl.web.panels import REPORT, run_folder
+from membrane_ctrl.web.panels import REPORT, SharedViews, run_folder
 
+_NICE = 5  # the hold comes first, also when the page was not started by one
 _AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
+_STUCK_S = 20.0  # for a message to leave
 _REPORT_BYTES_MAX = 64_000_000
+_FRESH = {"cache-control": "no-store"}
 
 
 def accounts_of(page: WebConfig) -> Accounts:
@@ -35,17 +42,36 @@ def accounts_of(page: WebConfig) -> Accounts:
 def serve(holds: dict[str, Where], page: WebConfig) -> None:
     """Serve the page of holds, by name, until interrupted. Raises InputError for a users file that is wrong."""
     accounts = accounts_of(page)
+    os.nice(max(0, _NICE - os.nice(0)))
     hosts = frozenset({*LOCAL_HOSTS, page.host, *page.names})
     feeds = {name: HoldFeed(where) for name, where in holds.items()}
+    app.add_middleware(HangUp)  # inside the login: the last added comes first
     app.add_middleware(LoginMiddleware, accounts=accounts, hosts=hosts)
     for feed in feeds.values():
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)
 
+    views = SharedViews(feeds)
+
     @ui.page("/", title="membrane_ctrl")
     def view(request: Request, hold: str = "") -> None:
         user: WebUser = request.scope["membrane_user"]
-        WebPage(feeds, hold if hold in feeds else next(iter(feeds)), user).build()
+        WebPage(feeds, hold if hold in feeds else next(iter(feeds)), user, views).build()
+
+    @app.get("/chart")
+    async def chart(hold: str, signal: str, span: str, utc: bool) -> Response:
+        if hold not in feeds or signal not in SIGNALS or span not in SPANS_S:
+            return Response(status_code=404)
+        packed = await views.charts.get(hold, signal, span, utc)
+        return Response(packed, media_type="application/json", headers={**_FRESH, "content-encoding": "gzip"})
+
+    @app.get("/map")
+    async def picture(hold: str, removed: str) -> Response:
+        figure = feeds[hold].seen.figure if hold in feeds else None
+        if figure is None or removed not in REMOVED:
+            return Response(status_code=404)
+        drawn = await views.maps.get(hold, removed, figure.time_s)
+        return Response(drawn.png, media_type="image/png", headers=_FRESH)
 
     @app.get("/report/{name}")
     def report(name: str, hold: str = "") -> HTMLResponse:
@@ -66,7 +92,37 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         reconnect_timeout=_AWAY_S,
         ssl_certfile=page.certificate_file,
         ssl_keyfile=page.key_file,
+        ws_per_message_deflate=False,  # updates are small; fifty compressors are not
     )
+
+
+class HangUp:
+    """ASGI middleware: hangs up on a viewer who does not read, and says so.
+
+    Engine.io notices a viewer who does not answer its pings, within 24 s; a viewer who answers but cannot be written
+    to is noticed here.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        left = scope["type"] != "websocket"
+
+        async def hear() -> Message:
+            nonlocal left
+            message = await receive()
+            left = left or message["type"] == "websocket.disconnect"
+            return message
+
+        async def tell(message: Message) -> None:
+            async with asyncio.timeout(_STUCK_S):  # TimeoutError is an OSError: the connection ends
+                await send(message)
+
+        await self._app(scope, hear, tell)
+        if not left:
+            user: WebUser = scope["membrane_user"]
+            print(f"membrane-ctrl web: viewer {user.name} does not read: hung up", file=sys.stderr, flush=True)
 
 
 def report_page(logs: Path | None, name: str) -> HTMLResponse:

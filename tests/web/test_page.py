@@ -79,6 +79,8 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-ge
 async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
     async with viewed(tmp_path) as (run, tab):
         assert "the-run" in await tab.value("document.body.innerText")
+        fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/chart?'))"
+        await tab.until(f"{fetched}.some(r => r.responseStatus === 200 && r.decodedBodySize > 500)")
         await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause')).click()")
         await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
         assert run.asked == [], "nothing is sent before the confirmation"

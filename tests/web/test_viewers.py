@@ -1,0 +1,126 @@
+"""Many viewers cost little more than one, and one who does not read is hung up on."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.sessions.folder import create_session
+from membrane_ctrl.sessions.live_log import LiveLog
+from membrane_ctrl.web import panels, server
+from membrane_ctrl.web.access import WebUser
+from membrane_ctrl.web.figures import Shared
+
+
+async def test_what_all_see_is_made_once_and_again_when_it_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[str, int]] = []
+    ready = threading.Event()
+
+    def make(name: str, number: int) -> str:
+        ready.wait(20.0)
+        made.append((name, number))
+        return f"{name}{number}"
+
+    shared = Shared(make, life_s=1.0)
+    asked = [asyncio.create_task(shared.get("a", 1)) for _ in range(50)]
+    leaving = asyncio.create_task(shared.get("a", 1))
+    other = asyncio.create_task(shared.get("b", 2))
+    await asyncio.sleep(0)
+    leaving.cancel()
+    monkeypatch.setattr("time.monotonic", lambda: 1e9)  # it takes longer than it lives: still made once
+    late = asyncio.create_task(shared.get("a", 1))
+    await asyncio.sleep(0)
+    ready.set()
+    assert await asyncio.gather(*asked, late) == ["a1"] * 51
+    assert await other == "b2"
+    assert sorted(made) == [("a", 1), ("b", 2)]
+    monkeypatch.setattr("time.monotonic", lambda: 2e9)
+    assert await shared.get("a", 1) == "a1"
+    assert sorted(made) == [("a", 1), ("a", 1), ("b", 2)]
+    assert len(shared._made) == 1, "what nobody asks for any more is forgotten"
+
+
+async def test_what_cannot_be_made_is_tried_again() -> None:
+    answers = iter([OSError("gone"), "found"])
+
+    def make() -> str:
+        answer = next(answers)
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    shared = Shared(make, life_s=0.0)
+    with pytest.raises(OSError, match="gone"):
+        await shared.get()
+    assert await shared.get() == "found"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ((), ("a", "b"), ("a", "b")),
+        (("a",), ("a", "b"), ("b",)),
+        (("a", "b"), ("a", "b"), ()),
+        (("a", "b", "c"), ("b", "c", "d"), ("d",)),  # the oldest was dropped
+        (("a", "a"), ("a", "a", "a"), ("a",)),
+        (("a", "b"), ("x", "y"), ("x", "y")),  # another run
+        (("a", "b"), (), ()),
+    ],
+)
+def test_only_new_lines_are_shown(old: tuple[str, ...], new: tuple[str, ...], expected: tuple[str, ...]) -> None:
+    assert panels.fresh(old, new) == expected
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+async def test_a_viewer_who_does_not_read_is_hung_up_on(
+    leaves: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(server, "_STUCK_S", 0.01)
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        if leaves:
+            assert (await receive())["type"] == "websocket.disconnect"
+            return
+        with pytest.raises(OSError):
+            await send({"type": "websocket.send", "text": "an update"})
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "websocket.disconnect"}
+
+    async def send(message: Any) -> None:
+        await asyncio.Event().wait()  # the transport's buffer is full
+
+    scope = {"type": "websocket", "membrane_user": WebUser("anna", "read")}
+    await server.HangUp(app)(scope, receive, send)  # type: ignore[arg-type]
+    assert capsys.readouterr().err == ("" if leaves else "membrane-ctrl web: viewer anna does not read: hung up\n")
+
+
+def test_the_newest_session_is_followed(tmp_path: Path) -> None:
+    watch = panels.SessionWatch(tmp_path)
+    assert watch.look() is None
+    path = create_session(tmp_path, "first", "eve", "twin", Config(), LoopConfig()).path
+    log = LiveLog(path, 50.0, print)
+    log.note("step", "observe", planned_s=60.0, after_s=0.0)
+    for number in range(300):
+        log.note("said", f"line {number}")
+    seen = watch.look()
+    assert seen is not None
+    assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
+    log.note("said", "line 300")
+    log.note("asks", "apply which?")
+    (path / "identified.json").write_text("{}")
+    later = watch.look()
+    assert later is not None
+    assert panels.fresh(seen.progress.said, later.progress.said) == ("line 300",)
+    assert later.head == f"{path.name}: observe, asks on its terminal: apply which?"
+    assert later.done == {"identify"}
+    log.note("ended", "stopped")
+    second = create_session(tmp_path, "second", "eve", "twin", Config(), LoopConfig()).path
+    newest = watch.look()
+    assert newest is not None
+    assert newest.head == f"{max(path, second).name}: " + ("begun" if second > path else "observe, ended: stopped")
