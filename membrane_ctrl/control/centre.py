@@ -17,9 +17,8 @@ import numpy as np
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import WalkNoise, Whiteness, smoothing
 from membrane_ctrl.control.gas import believed_weather
-from membrane_ctrl.control.sensor_noise import WalkNoise, Whiteness
 from membrane_ctrl.model.arrays import FloatArray
 
 _GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _STAND = range(7)

@@ -7,12 +7,9 @@ Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
 from membrane_ctrl.control.centre_estimate import CentreEstimate
-from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +73,7 @@ class InnerLoop:
         self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
         self._curve = gas.PumpCurve(pump)
         self._probe_um = pump.probe_um
-        self._drift = pump_drift.PumpDrift(DEAD_S, PUMP_LAG_S)
+        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S)
         self.may_probe = True  # not while gains are judged
         self.learned = False  # this tick has ended a segment that told something of the pump
         self._leak = film_health.LeakEstimate()
@@ -264,7 +261,7 @@ class InnerLoop:
         """Take another curve of the pump: the mean flow becomes what that says of the mean command."""
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
         self._flow_full_um_per_s, self._curve = pump.flow_full_um_per_s, gas.PumpCurve(pump)
-        self._drift, self._probe_um = pump_drift.PumpDrift(DEAD_S, PUMP_LAG_S), pump.probe_um
+        self._drift, self._probe_um = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S), pump.probe_um
         self.set_gains(self._loop)
         self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
         self._leak.pause()
@@ -319,48 +316,3 @@ class InnerLoop:
 
 def _gains(loop: LoopConfig) -> pid.PidGains:
     return pid.PidGains(loop.kp_per_s, loop.ti_s, loop.td_s)
-
-
-# Margins of the linear inner loop: the sampled loop as it runs, its dead times exact, at every frequency.
-
-
-# docs/physics.md, inner loop; the tick itself takes 5 ms from sample to write
-PUMP_LAG_S = 0.15
-DEAD_S = 0.075 + 0.005
-# Below the corner frequencies of the controller by this factor, L is a double integrator
-_FAR_BELOW = 0.01
-_POINTS = 2000
-_ALIASES = 3  # they fall with the third power of the frequency
-
-
-def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
-    """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump lag, mirror."""
-    dt_s = 1 / loop.rate_hz
-    z = np.exp(1j * omega * dt_s)
-    share = filters.smoothing(dt_s, loop.measurement_filter_s)
-    measurement_filter = share / (1 - (1 - share) / z)
-    derivative = loop.td_s * (1 - 1 / z) / dt_s
-    pi = loop.kp_per_s * (1 + dt_s / loop.ti_s / (z - 1) + derivative)  # the integrator moves after the output
-    mirror = np.zeros_like(z)
-    for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
-        s = 1j * (omega + 2 * math.pi * k / dt_s)
-        mirror += (1 - 1 / z) / (s * dt_s) * np.exp(-s * DEAD_S) / (1 + s * PUMP_LAG_S) / s
-    return np.asarray(pi * measurement_filter * mirror)
-
-
-def peak_sensitivity(loop: LoopConfig) -> float:
-    """Return the largest amplification of a disturbance at any frequency; infinity for an unstable loop.
-
-    The defaults stay below 1.4. NaN for a loop with `kp_per_s` 0.
-    """
-    if loop.kp_per_s == 0.0:
-        return math.nan
-    low = _FAR_BELOW * min(loop.kp_per_s, 1 / loop.ti_s)
-    omega = np.geomspace(low, math.pi * loop.rate_hz * 0.999, _POINTS)
-    difference = 1 + open_loop(loop, omega)
-    # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn from far below to
-    # the sampling limit; each further encirclement of -1 is a pair of unstable poles.
-    turned = float(np.unwrap(np.angle(difference))[-1] - np.angle(difference)[0])
-    if abs(turned - math.pi) > math.pi / 2:
-        return math.inf
-    return float(np.max(1 / np.abs(difference)))

@@ -8,7 +8,7 @@ from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.schema import Config, LoopConfig, OpticsConfig
-from membrane_ctrl.control import film, gas, inner_loop
+from membrane_ctrl.control import film, gas, pid
 from membrane_ctrl.controller import pump_obeys, safety
 
 Severity = Literal["error", "warning"]
@@ -101,7 +101,7 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
 
 def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
     """What is wrong with the gains of a loop on the nominal pump, if anything."""
-    sensitivity = inner_loop.peak_sensitivity(loop)
+    sensitivity = pid.peak_sensitivity(loop)
     gains = f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
     if loop.kp_per_s == 0.0:
         return "error", "nothing would hold the mirror"

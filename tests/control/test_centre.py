@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, Transit
-from membrane_ctrl.control.sensor_noise import WalkNoise, Whiteness
+from membrane_ctrl.control.filters import WalkNoise, Whiteness
 from tests.support.second_world import ForeignPlant, ForeignPump
 
 LOOP = LoopConfig()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control import inner_loop
+from membrane_ctrl.control import pid
 from membrane_ctrl.model import arrays, errors, states
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder
@@ -91,7 +91,7 @@ def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[loop_model.PlantModel,
         return session.found_of(newest).identified.model, f"plant of the session {newest.path.name}"
     except errors.InputError:
         leak = leak_um_per_s if math.isfinite(leak_um_per_s) else 0.0
-        plant = loop_model.PlantModel(1.0, inner_loop.DEAD_S, inner_loop.PUMP_LAG_S, leak)
+        plant = loop_model.PlantModel(1.0, pid.DEAD_S, pid.PUMP_LAG_S, leak)
         return plant, "plant as the configuration assumes it (no session has identified it)"
 
 
