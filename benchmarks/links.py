@@ -25,8 +25,8 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.bronkhorst import Instrument
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
+from firmware_iface.emulators.pumps import Instrument
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp, ModbusLink
 from firmware_iface.links.serial_port import SerialSettings

@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks.figures import Figure, at_most
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import BenchCommand

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from patience import patient_check
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config

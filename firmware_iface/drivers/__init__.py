@@ -1,4 +1,4 @@
-"""Drivers: one file per device, each of which fills a role of `roles.py`; and those of other packages.
+"""Drivers of devices, each of which fills a role of `roles.py`; and those of other packages.
 
 Another package names its driver in the entry point group `membrane_ctrl.drivers`, and an emulator of the instrument
 in `membrane_ctrl.emulators` (docs/new-device.md). Only an installed package is ever executed: no configuration, run

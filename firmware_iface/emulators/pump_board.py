@@ -1,11 +1,230 @@
-"""The membrane pump board as a Modbus TCP device over any plant."""
+"""The membrane pump board as a Modbus TCP device over any plant.
+
+`BoardState` is what it does, without bytes, clock or asyncio: registers, watchdog, latches, its own limits.
+"""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from firmware_iface.emulators import board_state, modbus_server
-from firmware_iface.register_map import RegisterMap, default_map
+from firmware_iface.emulators import modbus_server
+from firmware_iface.emulators.modbus_server import BUSY, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
+from firmware_iface.register_map import Block, Register, RegisterMap, default_map, make_block
+
+FIRMWARE_VERSION = 0x00_01_00_00  # 1.0.0
+# the paper's mirror works at 600 Pa; the controller's own limit (750 Pa) is to act first
+GAUGE_PRESSURE_LIMIT_PA = 800.0
+PUMP_LIMIT_FRACTION = 1.0
+WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
+_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # registers that read as 0
+# the register of a block that carries the claim's secret; a block without one needs no claim
+_KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
+
+
+@dataclass(frozen=True, slots=True)
+class BoardSample:
+    """One sample of the board's sensors; NaN where there is no value (units as in `roles.BenchReading`)."""
+
+    displacement_um: float
+    displacement_quality: int
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    sample_counter: int
+    device_time_s: float
+
+
+class BoardState:
+    """The board between two requests, of the map version of `registers`; it reports `map_version`.
+
+    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend
+    only on the time passed in.
+    """
+
+    def __init__(self, registers: RegisterMap, sample: BoardSample) -> None:
+        self.map_version = registers.map_version
+        self.registers = registers
+        self._by_address = {register.address: register for register in registers}
+        # drivers read whole blocks again and again: found at once
+        self._by_span = {(block.address, block.count): block for block in registers.blocks}
+        self._command = registers.block("command")
+        self._claims = registers.map_version >= 2
+        self._watchdog_mask = registers.fault_mask("watchdog")
+        self._over_pressure_mask = registers.fault_mask("over_pressure")
+        self._stopped_mask = registers.fault_mask("stopped") if self._claims else 0
+        self._sample = sample
+        self._now_s = 0.0
+        self.restart()
+
+    def restart(self) -> None:
+        """Power-up: outputs off, watchdog off, settings and faults lost."""
+        self._settable = {
+            "watchdog_period_s": WATCHDOG_PERIOD_S,
+            "watchdog_arm": 0.0,
+            "pump_command_fraction": 0.0,
+            "vent_command_fraction": 0.0,
+            "heartbeat": 0.0,
+            "clear_faults": 0.0,
+        }
+        self._claim_id = self._claim_key = 0.0
+        self._heartbeat_fed = 0.0
+        self._fed_s = 0.0
+        self._faults = 0
+
+    @property
+    def pump_fraction(self) -> float:
+        """What the pump is given: 0 while any fault is latched."""
+        return 0.0 if self._faults else min(self._settable["pump_command_fraction"], PUMP_LIMIT_FRACTION)
+
+    @property
+    def vent_fraction(self) -> float:
+        """How far the vent is open: fully after over-pressure.
+
+        A watchdog trip leaves it as commanded: a controller that died while venting must not stop the venting, and
+        one that died while holding had it closed or at a small bleed, on which the mirror sinks slowly.
+        """
+        return 1.0 if self._faults & self._over_pressure_mask else self._settable["vent_command_fraction"]
+
+    def advance(self, now_s: float, sample: BoardSample) -> None:
+        """Take the newest sample at a time (on any axis), then let the pressure limit and the watchdog act."""
+        self._now_s = now_s
+        self._sample = sample
+        if sample.gauge_pressure_pa > GAUGE_PRESSURE_LIMIT_PA:
+            self._latch(self._over_pressure_mask)
+        if self._settable["watchdog_arm"] and now_s - self._fed_s > self._settable["watchdog_period_s"]:
+            self._latch(self._watchdog_mask)
+
+    @property
+    def held(self) -> bool:
+        """A claim is held and its watchdog was fed in time: no other program may have the board.
+
+        A latched fault does not matter: a program may claim and hold a latched board.
+        """
+        return bool(self._claim_key) and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
+
+    def _latch(self, mask: int) -> None:
+        self._faults |= mask
+        self._settable["pump_command_fraction"] = 0.0  # so that nothing moves when the fault is cleared
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not exist."""
+        values = self._values()
+        whole = self._by_span.get((address, count))
+        if whole is not None:
+            return whole.encode(values)
+        end = address + count
+        words: dict[int, int] = {}
+        for block in self.registers.blocks:
+            if block.address < end and address < block.address + block.count:
+                words.update(enumerate(block.encode(values), block.address))
+        if len(words) < count or not all(at in words for at in range(address, end)):
+            raise RegisterRefusal(ILLEGAL_ADDRESS)
+        return [words[at] for at in range(address, end)]
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        """Write whole registers, all or none.
+
+        Raises RegisterRefusal: illegal address for a read-only or unknown register or for a part of one, illegal
+        value outside the limits and for disarming the watchdog while the pump is commanded. With claims, illegal
+        address for a part of a block, busy while another holds the board, illegal value without any claim.
+        """
+        target = self._written_block(address, len(words))
+        written = target.decode(words)
+        if not all(register.allows(written[register.name]) for register in target.registers):
+            raise RegisterRefusal(ILLEGAL_VALUE)
+        if self._claims:
+            self._check_claim(target.name, written)
+        disarms = written.get("watchdog_arm") == 0 and self._settable["watchdog_arm"]
+        if disarms and self._settable["pump_command_fraction"] > 0:
+            raise RegisterRefusal(ILLEGAL_VALUE)
+        if self._claims and target.name == "settings":
+            self._claim(written)
+        self._apply(written, whole_command=target.registers == self._command.registers)
+
+    def _check_claim(self, block: str, written: dict[str, float]) -> None:
+        key = _KEYS.get(block)
+        if key is None or written[key] == self._claim_key:
+            return
+        if self.held:
+            raise RegisterRefusal(BUSY)
+        if not written.get("watchdog_arm"):  # only arming makes a claim
+            raise RegisterRefusal(ILLEGAL_VALUE)
+
+    def _claim(self, written: dict[str, float]) -> None:
+        """Arming claims the board, disarming gives it back; a new claim has a whole period from now on."""
+        if not written["watchdog_arm"]:
+            self._claim_id = self._claim_key = 0.0
+            return
+        if written["claim_key"] != self._claim_key:
+            self._fed_s = self._now_s
+        self._claim_id, self._claim_key = written["claim_id"], written["claim_key"]
+
+    def _written_block(self, address: int, count: int) -> Block:
+        whole = self._by_span.get((address, count))
+        if whole is not None and whole.access == "rw":
+            return whole
+        if self._claims:
+            raise RegisterRefusal(ILLEGAL_ADDRESS)
+        found: list[Register] = []
+        end = address + count
+        while address < end:
+            register = self._by_address.get(address)
+            if register is None or register.access != "rw" or address + register.words > end:
+                raise RegisterRefusal(ILLEGAL_ADDRESS)
+            found.append(register)
+            address += register.words
+        return make_block("write", "rw", "", found)
+
+    def _apply(self, written: dict[str, float], *, whole_command: bool) -> None:
+        arms = bool(written.get("watchdog_arm")) and not self._settable["watchdog_arm"]
+        feeds = whole_command and written["heartbeat"] != self._heartbeat_fed
+        self._settable |= written
+        if feeds:
+            self._heartbeat_fed = written["heartbeat"]
+        cleared = int(self._settable["clear_faults"]) & self._faults
+        if cleared:
+            self._faults &= ~cleared
+            self._settable["pump_command_fraction"] = 0.0
+        self._settable["clear_faults"] = 0.0
+        if written.get("stop"):
+            self._latch(self._stopped_mask)
+        if arms or feeds or cleared & self._watchdog_mask:
+            self._fed_s = self._now_s
+
+    def _values(self) -> dict[str, float]:
+        sample = self._sample
+        whole_s = int(sample.device_time_s)
+        return {
+            **self._settable,
+            "device_kind": self.registers.device_kind,
+            "map_version": self.map_version,
+            "firmware_version": FIRMWARE_VERSION,
+            "gauge_pressure_limit_pa": GAUGE_PRESSURE_LIMIT_PA,
+            "pump_limit_fraction": PUMP_LIMIT_FRACTION,
+            "sample_counter": sample.sample_counter % 2**32,
+            "device_time_s": whole_s,
+            # cut, not rounded: 10000 of 10000 would be a second too many
+            "device_time_fraction_s": int((sample.device_time_s - whole_s) * 10_000) / 10_000,
+            "displacement_quality": sample.displacement_quality,
+            "displacement_um": sample.displacement_um,
+            "gauge_pressure_pa": sample.gauge_pressure_pa,
+            "ambient_pressure_pa": sample.ambient_pressure_pa,
+            "air_temperature_c": sample.air_temperature_c,
+            "gas_temperature_c": sample.gas_temperature_c,
+            "pump_readback_fraction": self.pump_fraction,
+            "vent_readback_fraction": self.vent_fraction,
+            "heartbeat_echo": self._heartbeat_fed,
+            "watchdog_armed": self._settable["watchdog_arm"],
+            "watchdog_tripped": float(bool(self._faults & self._watchdog_mask)),
+            "latched_faults": self._faults,
+            "period_in_force_s": self._settable["watchdog_period_s"],
+            "claim_in_force": self._claim_id,
+            "claim_id": self._claim_id,
+            **_SECRETS,
+        }
+
 
 _PERIOD_S = 0.01  # the board's own loop; the pump is off at most this and one wake-up after the watchdog period
 _GATEWAY_NO_RESPONSE = 11
@@ -14,7 +233,7 @@ _GATEWAY_NO_RESPONSE = 11
 class BoardPlant(Protocol):
     """The plant on the board's wires."""
 
-    def sample(self) -> board_state.BoardSample:
+    def sample(self) -> BoardSample:
         """The newest sample of the sensors; called every 10 ms and at every request."""
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
@@ -41,7 +260,7 @@ class PumpBoardEmulator:
         self._clock = clock or (lambda: asyncio.get_running_loop().time())
         self._unit_id = unit_id
         self._sample = plant.sample()
-        self.state = board_state.BoardState(registers or default_map(), self._sample)
+        self.state = BoardState(registers or default_map(), self._sample)
         self._actuated = (0.0, 0.0)
         self._server = modbus_server.ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None
@@ -88,7 +307,7 @@ class PumpBoardEmulator:
         self.state.advance(self._clock(), self._sample)
         self._actuate()
 
-    def newest(self) -> board_state.BoardSample:
+    def newest(self) -> BoardSample:
         """The sample of the sensors now."""
         return self._plant.sample()
 

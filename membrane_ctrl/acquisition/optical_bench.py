@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from firmware_iface import display, roles, settings
-from firmware_iface.drivers import camera_aravis, camera_folder, camera_uvc, screen_pygame
+from firmware_iface.drivers import camera_aravis, camera_opencv, screen_pygame
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
@@ -163,9 +163,9 @@ def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -
         case settings.AravisCameraConfig():
             return camera_aravis.AravisCamera(section, *size_px, clock.now, clock.sleep)
         case settings.UvcCameraConfig():
-            return camera_uvc.UvcCamera(section, *size_px, clock.now)
+            return camera_opencv.UvcCamera(section, *size_px, clock.now)
         case settings.FolderCameraConfig():
-            return camera_folder.FolderCamera(Path(section.folder).expanduser(), *size_px, clock.now)
+            return camera_opencv.FolderCamera(Path(section.folder).expanduser(), *size_px, clock.now)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import orders, phase
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
-from membrane_ctrl.metrology.frames.closure import Closure, closure, closure_with_phase
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack, bin_frames
-from membrane_ctrl.metrology.frames.integrity import Flag
+from membrane_ctrl.metrology.frames.integrity import Closure, Flag, closure, closure_with_phase
 from membrane_ctrl.metrology.frames.series_integrity import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 

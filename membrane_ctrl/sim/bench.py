@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
-from firmware_iface.emulators import board_state, pump_board
+from firmware_iface.emulators import pump_board
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
 from membrane_ctrl.model import clock, errors, terminal
@@ -144,7 +144,7 @@ class LiveBench:
         self._truth = truth
         self._sample = self._take_sample()
 
-    def sample(self) -> board_state.BoardSample:
+    def sample(self) -> pump_board.BoardSample:
         """The device's newest sample."""
         return self._sample
 
@@ -163,7 +163,7 @@ class LiveBench:
             self._plant.advance(steps * plant.STEP_S)
             self._sample = self._take_sample()
 
-    def _take_sample(self) -> board_state.BoardSample:
+    def _take_sample(self) -> pump_board.BoardSample:
         mirror = self._plant
         if self._truth is not None:
             truth = mirror.truth()

@@ -12,17 +12,7 @@ from pathlib import Path
 
 from firmware_iface import drivers, settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
-from firmware_iface.emulators import (
-    bronkhorst,
-    keyence_dl_rs1a,
-    mks_937b,
-    modbus_server,
-    optoncdt1420,
-    pump_board,
-    serial_device,
-    vaisala_ptb330,
-    ventus,
-)
+from firmware_iface.emulators import lasers, modbus_server, pressure_gauges, pump_board, pumps, serial_device
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.instruments import bench
@@ -48,7 +38,7 @@ class Lab:
         self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
             if isinstance(section, settings.BronkhorstModbusConfig):
-                self._tables[section.link][section.unit_id] = bronkhorst.BronkhorstRegisters(
+                self._tables[section.link][section.unit_id] = pumps.BronkhorstRegisters(
                     self._bronkhorst(role, section.serial)
                 )
             elif not isinstance(section, settings.ModbusMapConfig):
@@ -108,11 +98,11 @@ class Lab:
     def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
             case settings.Optoncdt1420Config():
-                return optoncdt1420.Optoncdt1420Emulator(
+                return lasers.Optoncdt1420Emulator(
                     self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
                 )
             case settings.KeyenceDlRs1aConfig():
-                return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
+                return lasers.KeyenceDlRs1aEmulator(
                     self._sensor("displacement"),
                     section.direction,
                     section.baud,
@@ -120,15 +110,15 @@ class Lab:
                     section.amplifier + 1,
                 )
             case settings.VaisalaPtb330Config():
-                return vaisala_ptb330.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+                return pressure_gauges.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
             case settings.Mks937bConfig():
-                return mks_937b.Mks937bEmulator(
+                return pressure_gauges.Mks937bEmulator(
                     self._sensor(role), section.baud, section.parity, section.address, section.channel
                 )
             case settings.VentusConfig():
-                return ventus.VentusEmulator(self._actuator("pump"), section.power_max_mw)
+                return pumps.VentusEmulator(self._actuator("pump"), section.power_max_mw)
             case settings.BronkhorstProparConfig():
-                return bronkhorst.ProparDevice(
+                return pumps.ProparDevice(
                     self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
                 )
             case settings.ExternalConfig():
@@ -165,13 +155,13 @@ class Lab:
                     raw_limits = (low, high)
             self._tables[link][unit_id] = MapDevice(sensors, outputs, constants, raw_limits)
 
-    def _bronkhorst(self, role: str, serial: str) -> bronkhorst.Instrument:
+    def _bronkhorst(self, role: str, serial: str) -> pumps.Instrument:
         if role == "pump":
-            return bronkhorst.Instrument(
+            return pumps.Instrument(
                 "DMFC", serial or "M20000001A", _FLOW_FULL_MLN_MIN, "mln/min", None, self._actuator(role)
             )
         gauge_pa = self._sensor("gauge_pressure")
-        return bronkhorst.Instrument(
+        return pumps.Instrument(
             "DEPC", serial or "M20000002A", _PRESSURE_FULL_MBAR, "mbar(g)", lambda: gauge_pa() / 100
         )
 

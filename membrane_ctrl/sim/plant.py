@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film, sensors

@@ -5,7 +5,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import TwinConfig
 
 # The true state, for the recording and the optics, never for the controller.

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from firmware_iface import register_map, roles
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators import board_state, modbus_server
+from firmware_iface.emulators import modbus_server, pump_board
 from firmware_iface.links.modbus_tcp import exception_error
 from membrane_ctrl.sim.plant import Plant
 
@@ -57,7 +57,7 @@ class VirtualBench:
         self.plant = plant
         self.wrong = Wrong()
         self._sample = self._sampled(None)
-        self.board = board_state.BoardState(register_map.default_map(), self._sample)
+        self.board = pump_board.BoardState(register_map.default_map(), self._sample)
         self._driver = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
 
     def advance(self, duration_s: float) -> None:
@@ -115,7 +115,7 @@ class VirtualBench:
         """Disarm if the board allows it, and disconnect."""
         at_once(self._driver.close())
 
-    def _sampled(self, last: board_state.BoardSample | None) -> board_state.BoardSample:
+    def _sampled(self, last: pump_board.BoardSample | None) -> pump_board.BoardSample:
         wrong = self.wrong
         self.truth = self.plant.truth()
         if wrong.samples_frozen and last is not None:

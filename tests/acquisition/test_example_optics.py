@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import LinkError
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 
 _PATIENCE_S = 8.0
 

@@ -9,7 +9,7 @@ import struct
 
 import pytest
 
-from firmware_iface.emulators import board_state
+from firmware_iface.emulators import pump_board
 from firmware_iface.emulators.modbus_server import respond
 from firmware_iface.register_map import Block, default_map
 from tests.board.virtual_board import NO_VALUE, VirtualBoard
@@ -31,7 +31,7 @@ class Twins:
         self.chance = chance
         self.raws = [0, 0, 101_325_000, 210_000, 220_000, 0]
         board.set_inputs(self.raws)
-        self.python = board_state.BoardState(_MAP, self._sample())
+        self.python = pump_board.BoardState(_MAP, self._sample())
         self.c.pass_us(10_000)
 
     def change_sensors(self) -> None:
@@ -42,13 +42,13 @@ class Twins:
         self.c.set_inputs(self.raws)
         self.c.pass_us(10_000)
 
-    def _sample(self) -> board_state.BoardSample:
+    def _sample(self) -> pump_board.BoardSample:
         """As the firmware takes them: at the first tick, then every five."""
         tick_ms = max(1, self.c.answered_us // 1000)
         count = (tick_ms - 1) // 5 + 1
         values = [math.nan if raw == NO_VALUE else raw for raw in self.raws[:5]]
         displacement, gauge, ambient, air, gas = values
-        return board_state.BoardSample(
+        return pump_board.BoardSample(
             displacement / 1000, self.raws[5], gauge / 1000, ambient / 1000, air / 10_000, gas / 10_000, count,
             (1 + 5 * (count - 1)) / 1000 + 1e-6,
         )  # fmt: skip

@@ -21,7 +21,7 @@ from campaign_world import WatchedPlant, World
 from hold_rig import BoardBench, HoldRig, LoopClock, a_hold, board_of, on_board
 
 from firmware_iface.drivers.bronkhorst import BronkhorstFlow, ModbusParameters
-from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
+from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.roles import (
     Bench,
     BenchCommand,

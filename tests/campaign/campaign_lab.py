@@ -11,8 +11,8 @@ from campaign_world import WatchedPlant
 
 from firmware_iface.drivers.bronkhorst import BronkhorstFlow, BronkhorstPressure, ModbusParameters
 from firmware_iface.drivers.modbus_map import ModbusValue, make_map
-from firmware_iface.emulators.bronkhorst import BronkhorstRegisters, Instrument
 from firmware_iface.emulators.modbus_server import RegisterRefusal, RegisterTable
+from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.role_bench import RoleBench, RoleDevices
 from firmware_iface.roles import (
     DeviceRefusedError,

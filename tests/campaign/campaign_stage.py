@@ -11,7 +11,7 @@ from campaign_times import TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command

@@ -15,7 +15,7 @@ import pytest
 from patience import patient_check
 
 from firmware_iface import drivers, role_bench, roles
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board

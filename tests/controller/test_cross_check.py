@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from patience import slow_machine
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 
-from firmware_iface.emulators.board_state import BoardSample
-from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from firmware_iface.emulators.pump_board import BoardSample, PumpBoardEmulator
 
 
 class Still:

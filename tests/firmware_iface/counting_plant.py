@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 
 
 class CountingPlant:

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.board_state import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState
 from firmware_iface.emulators.modbus_server import RegisterRefusal
+from firmware_iface.emulators.pump_board import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState
 from firmware_iface.register_map import known_maps
 
 SAMPLE = BoardSample(1.5, 0, 600.0, 101_325.0, 20.0, 21.0, 7, 3.25)

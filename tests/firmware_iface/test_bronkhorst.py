@@ -32,8 +32,8 @@ from firmware_iface.drivers.bronkhorst_propar import (
     split_binary,
     values,
 )
-from firmware_iface.emulators.bronkhorst import ANALOG_INPUT, BronkhorstRegisters, Instrument
 from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.pumps import ANALOG_INPUT, BronkhorstRegisters, Instrument
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from firmware_iface.drivers.camera_folder import FolderCamera
-from firmware_iface.drivers.camera_uvc import UvcCamera
+from firmware_iface.drivers.camera_opencv import FolderCamera, UvcCamera
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, Pattern
 from firmware_iface.settings import UvcCameraConfig
 

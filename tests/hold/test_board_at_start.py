@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.schema import Config, ResumeConfig

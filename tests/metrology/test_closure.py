@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frames.closure import closure, closure_with_level, closure_with_phase
+from membrane_ctrl.metrology.frames.integrity import closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.phase import equal_shifts
 
 PIXELS = 4000

@@ -10,8 +10,7 @@ import pytest
 from metrology_truth import TrueFilm, look
 
 from membrane_ctrl.metrology import phase
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.screen_face import Face
+from membrane_ctrl.metrology.optics.geometry import Face, Geometry
 
 PLACE = np.random.default_rng(5).uniform(-210, 190, 4000)
 

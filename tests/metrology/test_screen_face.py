@@ -19,8 +19,7 @@ from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.screen_face import Face
+from membrane_ctrl.metrology.optics.geometry import Face, Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from firmware_iface.emulators import pump_board
-from firmware_iface.emulators.board_state import BoardSample
 from firmware_iface.emulators.modbus_server import Answer, exception_pdu
+from firmware_iface.emulators.pump_board import BoardSample
 
 
 @dataclass(slots=True)

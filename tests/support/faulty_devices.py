@@ -7,16 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_iface.emulators import (
-    bronkhorst,
-    keyence_dl_rs1a,
-    mks_937b,
-    modbus_server,
-    optoncdt1420,
-    serial_device,
-    ventus,
-)
-from firmware_iface.emulators import vaisala_ptb330 as vaisala
+from firmware_iface.emulators import lasers, modbus_server, pressure_gauges, pumps, serial_device
 from firmware_iface.links.serial_port import Receiver, SerialPort
 from firmware_iface.roles import LinkDownError
 
@@ -85,11 +76,11 @@ class SerialDevice(serial_device.SerialDevice):
         return self.faults if self.draw_faults is None else self.draw_faults()
 
 
-class KeyenceDlRs1aEmulator(SerialDevice, keyence_dl_rs1a.KeyenceDlRs1aEmulator):
+class KeyenceDlRs1aEmulator(SerialDevice, lasers.KeyenceDlRs1aEmulator):
     pass
 
 
-class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
+class Optoncdt1420Emulator(SerialDevice, lasers.Optoncdt1420Emulator):
     """With noise of a single value; one byte in `lose_bytes_every` is lost from the stream (0: none)."""
 
     lose_bytes_every = 0
@@ -107,19 +98,19 @@ class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
         return super().digital(displacement_um + self.random.gauss(0.0, self._noise_um))
 
 
-class Mks937bEmulator(SerialDevice, mks_937b.Mks937bEmulator):
+class Mks937bEmulator(SerialDevice, pressure_gauges.Mks937bEmulator):
     pass
 
 
-class VaisalaPtb330Emulator(SerialDevice, vaisala.VaisalaPtb330Emulator):
+class VaisalaPtb330Emulator(SerialDevice, pressure_gauges.VaisalaPtb330Emulator):
     pass
 
 
-class VentusEmulator(SerialDevice, ventus.VentusEmulator):
+class VentusEmulator(SerialDevice, pumps.VentusEmulator):
     pass
 
 
-class ProparDevice(SerialDevice, bronkhorst.ProparDevice):
+class ProparDevice(SerialDevice, pumps.ProparDevice):
     pass
 
 

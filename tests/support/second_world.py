@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from firmware_iface.emulators.board_state import BoardSample
+from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 

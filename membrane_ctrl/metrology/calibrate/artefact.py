@@ -15,8 +15,7 @@ import numpy as np
 
 from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
 from membrane_ctrl.metrology.calibrate import parameters, solve
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.optics import SigmasConfig
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 # a, b and alpha: the paper's; the principal point: of the paper's camera

@@ -9,7 +9,7 @@ u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
     ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
 
 with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face that deviates by w
-= c s^2 + map (see `screen_face`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
+= c s^2 + map (see `optics.geometry`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
-from membrane_ctrl.metrology.optics import compiled, film_law, kernels, screen_face, zernike
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
+from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
@@ -212,7 +212,7 @@ def _derivatives(
     first = LOCAL + len(POSE)
     out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, -2] = across * square / onto / screen_face.BOW_RADIUS_MM**2
+    out[:, -2] = across * square / onto / BOW_RADIUS_MM**2
     out /= bench.pitch
     out[:, -1] = -m.screen_mm / bench.pitch**2
     return out

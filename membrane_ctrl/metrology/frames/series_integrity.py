@@ -5,7 +5,7 @@ disagreement is too large follows from the other series of the set, so that a di
 fault. Three checks:
 
 - equal pictures: no two frames of a set should be the same (a stale frame, however little it matters);
-- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at fault (`closure`);
+- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at fault;
 - the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but reverses the phase,
   which then contradicts the other frequencies.
 
@@ -19,7 +19,7 @@ from itertools import combinations
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.closure import Closure, closure, closure_with_level, closure_with_phase
+from membrane_ctrl.metrology.frames.integrity import Closure, closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.phase import phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.optics import film_law, screen_face
+from membrane_ctrl.metrology.optics import film_law, geometry
 from membrane_ctrl.metrology.optics.compiled import kernel, step
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 
@@ -116,11 +116,11 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
 @kernel
 def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
     """Deviation of the face at some points, in a separate loop: a look-up prevents vector instructions."""
-    if screen_face.is_plane(face):
+    if geometry.is_plane(face):
         out[:count] = 0.0
         return
     for k in range(count):
-        out[k], _wa, _wb = screen_face.face_height(face, screen[0, first + k], screen[1, first + k])
+        out[k], _wa, _wb = geometry.face_height(face, screen[0, first + k], screen[1, first + k])
 
 
 @kernel
@@ -306,13 +306,13 @@ def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-de
     A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met to rounding after
     three, a map of a few millimetres after four or five.
     """
-    if screen_face.is_plane(face):
+    if geometry.is_plane(face):
         return
     for k in range(count):
         a, b, ta, tb = out[0, first + k], out[1, first + k], tangents[0, k], tangents[1, k]
         w = 0.0
         for _ in range(FACE_STEPS):
-            height, wa, wb = screen_face.face_height(face, a + w * ta, b + w * tb)
+            height, wa, wb = geometry.face_height(face, a + w * ta, b + w * tb)
             w -= (w - height) / (1 - wa * ta - wb * tb)
         out[0, first + k] = a + w * ta
         out[1, first + k] = b + w * tb

@@ -1,12 +1,16 @@
-"""USB cameras without GenICam (UVC) through OpenCV's VideoCapture: role Camera.
+"""Cameras through OpenCV: role Camera.
 
-Source: OpenCV 4 documentation, `cv::VideoCapture` and `VideoCaptureProperties`. Such a camera runs freely and keeps
-frames in a queue; a frame belongs to a pattern only if its exposure started after the pattern appeared, so earlier
-frames are read and discarded.
+USB cameras without GenICam (UVC) by its VideoCapture. Source: OpenCV 4 documentation, `cv::VideoCapture` and
+`VideoCaptureProperties`. Such a camera runs freely and keeps frames in a queue; a frame belongs to a pattern only if
+its exposure started after the pattern appeared, so earlier frames are read and discarded.
+
+A folder of pictures: one file per exposure, in order of name, repeated endlessly. For trying the cycle without a
+camera, with pictures of a bench or from `membrane-ctrl simulate`.
 """
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -123,3 +127,74 @@ class UvcCamera:
             "port": config.port,
             "settings": f"{self._size[0]} x {self._size[1]}, exposure {config.exposure:g}, gain {config.gain:g}",
         }
+
+
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
+
+
+class FolderCamera:
+    """Camera and screen: after `show(pattern)` the next picture is the one of that name.
+
+    The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
+    """
+
+    def __init__(self, folder: Path, width_px: int, height_px: int, now: roles.Clock = time.monotonic) -> None:
+        self._folder, self._size, self._now = folder, (height_px, width_px), now
+        self._files: list[Path] = []
+        self._next = 0
+
+    def open(self) -> roles.DeviceIdentity:
+        """List the pictures. Raises LinkError without pictures, DeviceRefusedError for another size."""
+        if self._folder.is_dir():
+            self._files = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+        if not self._files:
+            raise roles.LinkError(f"camera: {self._folder}: contains no pictures ({', '.join(_SUFFIXES)})")
+        self._read(self._files[0])
+        return roles.DeviceIdentity("folder of frames", "", "", f"{len(self._files)} pictures in {self._folder}")
+
+    def show(self, pattern: roles.Pattern) -> None:
+        """Role Screen: choose the picture of this name; without one the next in the order comes."""
+        if not self._files:
+            self.open()
+        names = [path.stem for path in self._files]
+        if pattern.name in names:
+            self._next = names.index(pattern.name)
+
+    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
+        """The next picture. Raises LinkError if it cannot be read or has another size."""
+        if not self._files:
+            self.open()
+        time_s = self._now()
+        pixels = self._read(self._files[self._next % len(self._files)])
+        self._next = (self._next + 1) % len(self._files)
+        if out is None:
+            return roles.Frame(pixels, time_s)
+        if out.dtype != pixels.dtype:
+            raise roles.LinkError(
+                f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits requires {out.dtype}"
+            )
+        np.copyto(out, pixels)
+        return roles.Frame(out, time_s)
+
+    def close(self) -> None:
+        """Start from the first picture next time."""
+        self._files, self._next = [], 0
+
+    def describe(self) -> dict[str, str]:
+        """For people."""
+        return {"port": str(self._folder), "settings": f"{self._size[1]} x {self._size[0]}"}
+
+    def _read(self, path: Path) -> roles.Pixels:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise roles.LinkError(f"camera: {path}: cannot be read as a picture")
+        if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+            raise roles.DeviceRefusedError(
+                f"camera: {path}: {image.dtype} with {image.ndim} axes; expected 8- or 16-bit grey"
+            )
+        if image.shape != self._size:
+            raise roles.DeviceRefusedError(
+                f"camera: {path}: {image.shape[1]} x {image.shape[0]} pixels, [optics.camera] says "
+                f"{self._size[1]} x {self._size[0]}"
+            )
+        return image  # type: ignore[return-value]  # OpenCV's stubs know only its general array
