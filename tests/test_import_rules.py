@@ -131,12 +131,9 @@ def test_the_tick_is_pure(file: Path) -> None:
     assert not {m for m in found if allowed(m, IO | NOT_PLAIN)}
 
 
-@pytest.mark.parametrize(
-    "file", files_of("membrane_ctrl/controller/safety.py", "membrane_ctrl/controller/safety_rules.py"), ids=str
-)
-def test_safety_knows_only_plain_data(file: Path) -> None:
-    may = {"firmware_iface.roles", "membrane_ctrl.controller.safety_rules"}
-    assert not {m for m in ours(imports_of(file)) if not allowed(m, may | PLAIN_DATA)}
+def test_safety_knows_only_plain_data() -> None:
+    (file,) = files_of("membrane_ctrl/controller/safety.py")
+    assert not {m for m in ours(imports_of(file)) if not allowed(m, {"firmware_iface.roles"} | PLAIN_DATA)}
 
 
 @pytest.mark.parametrize("file", files_of("membrane_ctrl/sim"), ids=str)

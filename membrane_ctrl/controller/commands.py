@@ -7,7 +7,8 @@ from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
-from membrane_ctrl.controller.safety_rules import MOVING
+from membrane_ctrl.controller.safety import MOVING
+from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.states import State
 
 Kind = Literal[
@@ -138,6 +139,34 @@ def refusal(command: Command, state: State, config: Config) -> str:
     if command.kind == "capture" and not config.shape.enabled:
         return "no shape measurement in this run: [shape] enabled = false"
     return ""
+
+
+def taken(command: Command, refused: str) -> CommandTaken:
+    """The event of a command: its sender, reason and settings, and why it was refused (empty: it was not)."""
+    spec = command.experiment
+    return CommandTaken(
+        command=command.kind,
+        who=command.who,
+        why=command.why,
+        value=_or_none(command.value),
+        text=command.text or None,
+        loop=_settings(command),
+        experiment=None if spec is None else spec.model_dump(exclude=None if spec.steps else {"steps"}),
+        shape_time_constant_s=_or_none(command.shape_time_constant_s),
+        setpoint_step_um=_or_none(command.setpoint_step_um),
+        refused=refused or None,
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _settings(command: Command) -> dict[str, object] | None:
+    """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
+    if command.loop is None:
+        return None
+    return command.loop.model_dump() | ({} if command.pump is None else {"pump": command.pump.model_dump()})
 
 
 class GainsTrial:

@@ -12,18 +12,9 @@ from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import machine, trial
-from membrane_ctrl.controller import (
-    commands,
-    holders,
-    pump_obeys,
-    safe_levels,
-    safety,
-    safety_rules,
-    sensor_consistency,
-    states,
-)
+from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, sensor_consistency, states
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.scene import Scene, telemetry_row
+from membrane_ctrl.controller.scene import Scene, obey, telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
@@ -32,8 +23,6 @@ from membrane_ctrl.model.states import SafeLevel, State
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
-# the operator's line names the sender of these commands
-_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 
 
@@ -58,7 +47,7 @@ class Controller:
         self._setpoint_back_um = math.nan  # after a trial that steps the setpoint
         self._shape_back = False  # likewise: the shape loop is on again
         self._consistency = sensor_consistency.SensorConsistency(config)
-        self._holders = holders.Holders(config)
+        self._holders = sensor_consistency.Holders(config)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
         self._tick_error = ""
@@ -68,7 +57,7 @@ class Controller:
         self._why_since_s = 0.0
         self._shape_was: tuple[int, str] = (-1, "")
         self.state = State.STANDBY
-        self.fault: safety_rules.Rule | None = None
+        self.fault: safety.Rule | None = None
 
     @property
     def loop_config(self) -> LoopConfig:
@@ -86,22 +75,11 @@ class Controller:
         events: list[told.Event] = []
         self._begin(inputs, events)
         last = scene.output or inner_loop.NO_OUTPUT
-        judged = self.state in safety_rules.MOVING and not scene.paused  # nothing follows a setpoint in a pause
+        judged = self.state in safety.MOVING and not scene.paused  # nothing follows a setpoint in a pause
         error_um = last.error_um if judged else math.nan
-        left_um = scene.setpoint_um + scene.trim_um - last.setpoint_um
         scene.observer.look(inputs)
-        held = sensor_consistency.HoldStatus(
-            laser_um=scene.observer.displacement_um,
-            gauge_pressure_pa=scene.observer.gauge_pressure_pa,
-            setpoint_um=scene.setpoint_um,
-            trim_um=scene.trim_um,
-            ramp_left_um=left_um,
-            leak_um_per_s=last.leak_um_per_s,
-            flow_um_per_s=last.flow_um_per_s,
-            bleed_fraction=scene.loop_config.bleed_fraction,
-        )
         consistency = self._consistency
-        events += consistency.ask(inputs, self.state, scene.dt_s, held)
+        events += consistency.ask(inputs, self.state, scene.dt_s, sensor_consistency.hold_status(scene, last))
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
         observation = replace(
@@ -173,20 +151,7 @@ class Controller:
             or self._prepare(command)
         )
         self._answers.append((command.number, refused))
-        spec = command.experiment
-        taken = told.CommandTaken(
-            command=command.kind,
-            who=command.who,
-            why=command.why,
-            value=_or_none(command.value),
-            text=command.text or None,
-            loop=_settings(command),
-            experiment=None if spec is None else spec.model_dump(exclude=None if spec.steps else {"steps"}),
-            shape_time_constant_s=_or_none(command.shape_time_constant_s),
-            setpoint_step_um=_or_none(command.setpoint_step_um),
-            refused=refused or None,
-        )
-        events.append(taken)
+        events.append(commands.taken(command, refused))
         if not refused:
             self._do(command)
         return not refused
@@ -194,17 +159,8 @@ class Controller:
     def _do(self, command: commands.Command) -> None:
         scene = self._scene
         match command.kind:
-            case "hold":
-                scene.hold_wanted = True
-            case "manual":
-                scene.manual_wanted, scene.manual_um_per_s = True, command.value
-                scene.manual_since_s = scene.now_s
-            case "pause" | "resume":
-                scene.paused = command.kind == "pause"
-            case "setpoint":
-                scene.setpoint_um = command.value
-                if math.isfinite(self._setpoint_back_um):  # it stays
-                    self._setpoint_back_um = command.value
+            case "setpoint" if math.isfinite(self._setpoint_back_um):  # it stays
+                self._setpoint_back_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
                 self._gains.begin(
@@ -222,25 +178,11 @@ class Controller:
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
                 self._shape_back = command.kind == "shape_on"
-            case "latch":
-                scene.latched = scene.latched or command.text or f"locked by {command.who}"
-                scene.hold_wanted = scene.acknowledged = False
             case "resumed":
                 self._resume.resumed(scene.now_s - command.value)
             case "ack":
-                scene.latched = ""
-                scene.acknowledged = self.state == State.FAULT
                 self._clear_mask = ALL_FAULTS
-            case "stop":
-                scene.way_down = "stop"
-                scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
-            case "vent" if self.state == State.FAULT:
-                scene.levels.enter(SafeLevel.VENT, scene.now_s)
-            case "lower" | "vent":
-                scene.way_down = scene.way_down or "lower"
-                scene.venting |= command.kind == "vent"
-        if command.kind in _MOVES:
-            scene.asked_by = command.who
+        obey(scene, command, self.state)
 
     def _prepare(self, command: commands.Command) -> str:
         """Prepare the experiment of a `tune`; returns why the command is refused, or an empty text."""
@@ -290,7 +232,7 @@ class Controller:
         self._set_gains(self._gains.revert())
         events.append(told.GainsReverted(why))
 
-    def _consider_resuming(self, observation: safety_rules.Observation) -> None:
+    def _consider_resuming(self, observation: safety.Observation) -> None:
         """Decide whether a latched fault may clear automatically (`resume`)."""
         scene, resume = self._scene, self._resume
         if self.state != State.FAULT or self.fault is None:
@@ -329,7 +271,7 @@ class Controller:
             settled,
             self._consistency.camera_lies,
         )
-        scene.trim_um = shape.trim_um if self.state in safety_rules.MOVING else 0.0
+        scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news
         if (shape.state, words) != self._shape_was:
             self._shape_was = (shape.state, words)
@@ -398,14 +340,3 @@ class Controller:
         if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
             self._said_why = words
             events.append(told.Why(scene.why))
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _settings(command: commands.Command) -> dict[str, object] | None:
-    """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
-    if command.loop is None:
-        return None
-    return command.loop.model_dump() | ({} if command.pump is None else {"pump": command.pump.model_dump()})

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from membrane_ctrl.config.schema import Config, PumpConfig
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import pump_obeys, safety, safety_rules
+from membrane_ctrl.controller import pump_obeys, safety
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.model import object_codec, shape_estimate
 from membrane_ctrl.model.telemetry import TODAY
@@ -81,13 +81,13 @@ def _specials(config: Config) -> object_codec.Specials:
 
     return {
         BaseModel: object_codec.Special(model, model_again),
-        safety_rules.Rule: object_codec.Special(lambda rule: rule.code, _rule),
+        safety.Rule: object_codec.Special(lambda rule: rule.code, _rule),
         shape_estimate.ShapeEstimate: object_codec.ESTIMATE,
         Trial: object_codec.Special(_no_trial, _no_trial_again),
     }
 
 
-def _rule(data: Any, _: type) -> safety_rules.Rule:
+def _rule(data: Any, _: type) -> safety.Rule:
     if type(data) is not int or data not in _RULES:
         raise object_codec.CodecError(f"the safety table has no rule {str(data)[:40]!r}")
     return _RULES[data]

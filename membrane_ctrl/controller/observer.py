@@ -4,7 +4,7 @@ import math
 
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
-from membrane_ctrl.controller import safety_rules, tick
+from membrane_ctrl.controller import safety, tick
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
 
@@ -90,11 +90,11 @@ class Observer:
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
 
-    def observe(self, inputs: tick.TickInputs, error_um: float) -> safety_rules.Observation:
+    def observe(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
         """Return what the inputs show, after `look`; the control code fills in what it knows itself."""
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
-        return safety_rules.Observation(
+        return safety.Observation(
             link_up=inputs.link_up,
             reading_age_s=now_s - self._last_read_s,
             advance_age_s=now_s - self._last_advance_s,

@@ -1,4 +1,4 @@
-"""Data that the states' handlers share, and the telemetry row of a tick."""
+"""Data that the states' handlers share: filled by commands and the tick, told as the tick's telemetry row."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from membrane_ctrl.control import filters, inner_loop, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import pump_obeys, safe_levels, safety_rules, tick
+from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, states, telemetry
 
@@ -89,6 +89,17 @@ class Scene:
         self.output, self.pump_fraction = output, output.pump_fraction
         self.vent_fraction = self.loop_config.bleed_fraction
 
+    def keep_flowing(self) -> None:
+        """Continue as in the last tick: the new state takes over in the next one."""
+        self.pump_fraction = self.last_pump_fraction
+        self.vent_fraction = self.loop_config.bleed_fraction
+
+    @property
+    def strayed(self) -> bool:
+        """Whether the mirror has moved too far from its setpoint while no loop holds it."""
+        away_um = abs(self.observer.displacement_um - self.setpoint_um - self.trim_um)
+        return away_um > self.config.states.manual_range_um
+
     def stay_good(self, good: bool) -> float:
         """How long `good` has been true without a break, in seconds."""
         if not good:
@@ -99,13 +110,47 @@ class Scene:
         return self.now_s - self.good_since_s
 
 
+# the operator's line names the sender of these commands
+_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
+
+
+def obey(scene: Scene, command: commands.Command, state: states.State) -> None:
+    """Take an accepted command's request into the scene; the controller does the rest."""
+    match command.kind:
+        case "hold":
+            scene.hold_wanted = True
+        case "manual":
+            scene.manual_wanted, scene.manual_um_per_s = True, command.value
+            scene.manual_since_s = scene.now_s
+        case "pause" | "resume":
+            scene.paused = command.kind == "pause"
+        case "setpoint":
+            scene.setpoint_um = command.value
+        case "latch":
+            scene.latched = scene.latched or command.text or f"locked by {command.who}"
+            scene.hold_wanted = scene.acknowledged = False
+        case "ack":
+            scene.latched = ""
+            scene.acknowledged = state == states.State.FAULT
+        case "stop":
+            scene.way_down = "stop"
+            scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
+        case "vent" if state == states.State.FAULT:
+            scene.levels.enter(states.SafeLevel.VENT, scene.now_s)
+        case "lower" | "vent":
+            scene.way_down = scene.way_down or "lower"
+            scene.venting |= command.kind == "vent"
+    if command.kind in _MOVES:
+        scene.asked_by = command.who
+
+
 def telemetry_row(
     scene: Scene,
     state: states.State,
     fault: int,
     number: int,
     inputs: tick.TickInputs,
-    observation: safety_rules.Observation,
+    observation: safety.Observation,
     shape: shape_loop.ShapeOutput,
 ) -> telemetry.TelemetryRow:
     """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""

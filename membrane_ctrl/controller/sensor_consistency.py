@@ -1,13 +1,18 @@
-"""Compares the sensors of a held mirror with each other and the film: which is wrong, what is wearing out."""
+"""The sensors of a held mirror: which one is wrong by the others and the film, what wears out, which ones hold it."""
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control import film, film_health, gas, inner_loop
-from membrane_ctrl.controller import safety_rules, tick
-from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, Plausibility, PumpLearned
-from membrane_ctrl.model.states import State
+from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
+from membrane_ctrl.controller import safety
+from membrane_ctrl.controller.scene import Scene
+from membrane_ctrl.controller.tick import TickInputs
+from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
+from membrane_ctrl.model.states import ShapeState, State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
 # No two cycles have the same noise; a shape that appears twice may be a repeated message
@@ -29,6 +34,20 @@ class HoldStatus:
     leak_um_per_s: float  # as the inner loop estimates it; NaN without
     flow_um_per_s: float  # of the pump; NaN without
     bleed_fraction: float  # of the vent, held open on purpose
+
+
+def hold_status(scene: Scene, last: inner_loop.LoopOutput) -> HoldStatus:
+    """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick before."""
+    return HoldStatus(
+        laser_um=scene.observer.displacement_um,
+        gauge_pressure_pa=scene.observer.gauge_pressure_pa,
+        setpoint_um=scene.setpoint_um,
+        trim_um=scene.trim_um,
+        ramp_left_um=scene.setpoint_um + scene.trim_um - last.setpoint_um,
+        leak_um_per_s=last.leak_um_per_s,
+        flow_um_per_s=last.flow_um_per_s,
+        bleed_fraction=scene.loop_config.bleed_fraction,
+    )
 
 
 class SensorConsistency:
@@ -59,7 +78,7 @@ class SensorConsistency:
         self._weather_told = False
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
 
-    def ask(self, inputs: tick.TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
+    def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
         """Observe a tick and return its new events; judges only a held mirror."""
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
         if held.setpoint_um != self._setpoint_um:
@@ -68,7 +87,7 @@ class SensorConsistency:
         if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
             self._bleed_fraction = held.bleed_fraction
             self._growth.reset()
-        if state in safety_rules.CONNECTED:
+        if state in safety.CONNECTED:
             self.laser_gauge_apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
         elif self._film.watching:
             self._film.reset()
@@ -100,7 +119,7 @@ class SensorConsistency:
             self._plausibility.reset()
         return self._judge(film.Liar.NOBODY)
 
-    def _look_at_camera(self, inputs: tick.TickInputs) -> None:
+    def _look_at_camera(self, inputs: TickInputs) -> None:
         """Note when the camera last saw the film, and how often it repeated one shape bit by bit."""
         estimate = inputs.estimate
         if estimate is None or estimate.verdict == "rejected":
@@ -109,7 +128,7 @@ class SensorConsistency:
         self._repeats = self._repeats + 1 if estimate.sag_um == self._sag_um else 0
         self._sag_um = estimate.sag_um
 
-    def _most_growth(self, inputs: tick.TickInputs) -> float:
+    def _most_growth(self, inputs: TickInputs) -> float:
         """Allowed growth of the leak: unlimited while the camera agrees with the laser."""
         if self._repeats >= _REPEATS:
             return self._leak_growth_max
@@ -117,7 +136,7 @@ class SensorConsistency:
             return self._leak_growth_max
         return math.inf if self._liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
 
-    def _judge_weather(self, inputs: tick.TickInputs, dt_s: float) -> list[Event]:
+    def _judge_weather(self, inputs: TickInputs, dt_s: float) -> list[Event]:
         """Report once that a barometer or thermometer is implausible; the loop ignores it."""
         reading = inputs.reading
         if reading is None:
@@ -147,3 +166,90 @@ class SensorConsistency:
 
 def _of_warning(warning: film_health.FilmWarning) -> Event:
     return (Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message)
+
+
+# in `inflate` the film's gain may still be another one
+_ESTIMATED = frozenset({State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
+_STANDS_S = 1.0  # a sensor that comes and goes within this is not reported
+
+
+class Holders:
+    """Runs the estimate beside the states if `estimator.process_value` asks for it."""
+
+    def __init__(self, config: Config) -> None:
+        self._wanted = config.estimator.process_value == "estimate"
+        self._filter = CentreFilter(config.estimator, config.loop)
+        self._running = self._locking = False
+        self._told: tuple[int, ...] | None = None
+        self._news_s = math.nan
+        self.estimate: CentreEstimate | None = None
+
+    @property
+    def optics_hold(self) -> bool:
+        """Whether the mirror is held without a laser: the optics see it."""
+        return self.estimate is not None and self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+
+    def set_gains(self, loop: LoopConfig) -> None:
+        """Take the feed-forward's gains from other settings."""
+        self._filter.set_gains(loop)
+
+    def step(
+        self,
+        inputs: TickInputs,
+        state: State,
+        scene: Scene,
+        last: inner_loop.LoopOutput,
+        shape: ShapeState,
+        consistency: SensorConsistency,
+    ) -> list[Event]:
+        """One tick, after the sensors were judged; returns what is news."""
+        flow_um_per_s, laser_um = last.flow_um_per_s, scene.observer.displacement_um
+        if not self._wanted or state not in _ESTIMATED or not math.isfinite(flow_um_per_s):
+            self.estimate, self._running, self._told = None, False, None
+            return []
+        if consistency.laser_lies:
+            laser_um = math.nan
+        if not self._running:
+            start_um = last.filtered_um if math.isfinite(last.filtered_um) else laser_um
+            if not math.isfinite(start_um):
+                return []
+            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um)
+            self._running = True
+        if shape == ShapeState.OFF:
+            self._locking = True
+        elif self._locking:
+            self._filter.relock()
+            self._locking = False
+        figure = inputs.estimate
+        if shape == ShapeState.OFF or consistency.camera_lies or (figure and figure.verdict == "rejected"):
+            figure = None
+        reading = inputs.reading
+        readings = CentreReadings(
+            now_s=inputs.now_s,
+            flow_um_per_s=flow_um_per_s,
+            laser_um=laser_um,
+            ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
+            air_temperature_c=reading.air_temperature_c if reading else math.nan,
+            sag_um=figure.sag_um if figure else math.nan,
+            sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
+            sag_time_s=figure.time_s if figure else math.nan,
+        )
+        self.estimate = self._filter.step(readings, scene.dt_s)
+        scene.trim_um = self.estimate.mount_um
+        return self._news(inputs.now_s, self.estimate.jumped)
+
+    def _sees(self, sensor: Sensor) -> bool:
+        return self.estimate is not None and self.estimate.sensors[sensor].fresh
+
+    def _news(self, now_s: float, jumped: Collection[str]) -> list[Event]:
+        """Report the sensors once they have stood for a second, and every jump."""
+        seeing = tuple(int(sensor) for sensor in Sensor if self._sees(sensor))
+        if seeing == self._told:
+            self._news_s = math.nan
+        elif math.isnan(self._news_s):
+            self._news_s = now_s
+        stands = not math.isnan(self._news_s) and now_s - self._news_s >= _STANDS_S
+        if not stands and not jumped:
+            return []
+        self._told, self._news_s = seeing, math.nan
+        return [HeldBy(", ".join(Sensor(n).name.lower() for n in seeing), ", ".join(jumped))]

@@ -96,7 +96,7 @@ def hold(scene: Scene) -> State:
     if scene.paused:
         scene.give(scene.loop.stale(_given(scene, scene.setpoint_um), scene.dt_s))
         scene.why = f"paused by {scene.asked_by}: the pump keeps its mean flow"
-        if scene.stay_good(True) > scene.config.states.pause_max_s or _strayed(scene):
+        if scene.stay_good(True) > scene.config.states.pause_max_s or scene.strayed:
             scene.paused = False
         return State.HOLD
     scene.good_since_s = math.nan
@@ -108,7 +108,7 @@ def manual(scene: Scene) -> State:
     """Give the flow a person has requested; the loop tracks it, so that `hold` takes over without a bump."""
     if scene.hold_wanted:
         scene.why = f"{scene.asked_by} requested a hold again"
-        _keep_flowing(scene)
+        scene.keep_flowing()
         return State.INFLATE
     over = _manual_over(scene)
     flow_um_per_s = scene.mean_flow_um_per_s if over else scene.manual_um_per_s
@@ -242,28 +242,16 @@ def _way(scene: Scene) -> str:
     return f"{way} requested by {scene.asked_by}"
 
 
-def _strayed(scene: Scene) -> bool:
-    """Whether the mirror has moved too far from its setpoint while no loop holds it."""
-    away_um = abs(scene.observer.displacement_um - scene.setpoint_um - scene.trim_um)
-    return away_um > scene.config.states.manual_range_um
-
-
 def _manual_over(scene: Scene) -> str:
     """Why the loop takes over from manual flow; empty if it does not."""
     states = scene.config.states
     if scene.levels.safe_level != SafeLevel.NONE:
         return "the safety table holds the mean flow"
-    if _strayed(scene):
+    if scene.strayed:
         return f"more than {states.manual_range_um:g} um from the setpoint"
     if scene.now_s - scene.manual_since_s > states.manual_max_s:
         return f"no flow was set for {states.manual_max_s:g} s"
     return ""
-
-
-def _keep_flowing(scene: Scene) -> None:
-    """Continue as in the last tick: the new state takes over in the next one."""
-    scene.pump_fraction = scene.last_pump_fraction
-    scene.vent_fraction = scene.loop_config.bleed_fraction
 
 
 def _asked_elsewhere(scene: Scene) -> State | None:
@@ -276,7 +264,7 @@ def _asked_elsewhere(scene: Scene) -> State | None:
         scene.hold_wanted = False
         scene.why = f"{scene.asked_by} took over the pump"
         scene.mean_flow_um_per_s = scene.loop.mean_flow_um_per_s
-        _keep_flowing(scene)
+        scene.keep_flowing()
         return State.MANUAL
     return None
 

@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesC
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, in_order
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.safety_rules import MOVING
+from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken

@@ -8,7 +8,7 @@ from dataclasses import replace
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.safety_rules import Observation
+from membrane_ctrl.controller.safety import Observation
 from membrane_ctrl.controller.tick import TickInputs
 
 

@@ -12,7 +12,7 @@ from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import TABLE, Command
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.safety_rules import MOVING
+from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.states import SafeLevel, State

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.safety import TABLE
-from membrane_ctrl.controller.safety_rules import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, Rule
+from membrane_ctrl.controller.safety import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, TABLE, Rule
 from membrane_ctrl.model.states import SafeLevel, State
 
 _DOCS = Path(__file__).parents[2] / "docs"
