@@ -27,7 +27,7 @@ from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import CommandError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import second_world

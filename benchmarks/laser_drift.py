@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from tests.support.virtual_camera import VirtualCamera
 from tests.support.virtual_record import run_virtual

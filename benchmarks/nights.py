@@ -21,8 +21,7 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.controller.tick import RECORD, TICK, TickBatch
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import ShapeState, State
-from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows
+from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows, ShapeState, State
 from membrane_ctrl.run_files.tables import GIVEN, ColumnTables
 
 RATE_HZ = 10.0

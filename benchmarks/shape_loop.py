@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig, ShapeConfig, Twi
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sim.plant import Plant
 
 # Of a paraboloid with a little of the Hencky bowl's spherical terms (Noll 4, 11, 22); piston follows the vertex.

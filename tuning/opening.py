@@ -11,7 +11,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.errors import DeviceError, InputError, writing
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, newest_session, open_session
@@ -176,7 +176,7 @@ class TwinHold:
         self._pending: tuple[Command, ...] = (Command("hold", "tuning session"),)
         self._early = News((), (), ())
         self.rows: list[telemetry.TelemetryRow] = []
-        while not self.rows or self.rows[-1].state != states.State.HOLD:
+        while not self.rows or self.rows[-1].state != telemetry.State.HOLD:
             self._advance(1)
             if self._run.now_s > _HELD_WITHIN_S:
                 raise HoldError(f"the twin is not held within {_HELD_WITHIN_S:g} s; is its configuration sound?")

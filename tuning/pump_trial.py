@@ -8,7 +8,7 @@ import numpy as np
 from membrane_ctrl.config import schema
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments import machine
-from membrane_ctrl.model import errors, states, telemetry
+from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
 from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey, records
@@ -135,7 +135,7 @@ def _returned(rig: HoldRig) -> records.Record:
 
 def run_of(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_curve.PumpRun:
     """The ticks of an experiment with pump commands; the hold before and after it does not count."""
-    tune = [row for row in rows if row.state == states.State.TUNE][1:]  # the first still has the loop's command
+    tune = [row for row in rows if row.state == telemetry.State.TUNE][1:]  # the first still has the loop's command
     columns = (
         [getattr(row, name) for row in tune] for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")
     )

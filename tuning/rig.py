@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import events, shape_estimate, states, telemetry
+from membrane_ctrl.model import events, shape_estimate, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
 from tuning.identification.records import Record, Series
 
@@ -116,7 +116,7 @@ def laser_noise_um(record: Record) -> float:
 # in between (a fit takes a second) is in the next record and not lost.
 
 Progress = Callable[[float], None]  # seconds of hold recorded since the last call
-_HELD = frozenset({states.State.HOLD, states.State.TUNE})
+_HELD = frozenset({telemetry.State.HOLD, telemetry.State.TUNE})
 _ANSWER_TICKS = 500  # for the state to change after a command: 10 s at 50 Hz
 
 
@@ -167,9 +167,9 @@ class HoldRig:
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
         rows: list[telemetry.TelemetryRow] = []
         begun = False
-        while not begun or rows[-1].state == states.State.TUNE:
+        while not begun or rows[-1].state == telemetry.State.TUNE:
             rows.append(self._next_held())
-            begun = begun or rows[-1].state == states.State.TUNE
+            begun = begun or rows[-1].state == telemetry.State.TUNE
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
@@ -206,13 +206,13 @@ class HoldRig:
     def end_experiment(self) -> None:
         """End the experiment that runs, perhaps that of a session that was killed, and discard its ticks."""
         self._take()
-        if not self._rows or self._rows[-1].state != states.State.TUNE:
+        if not self._rows or self._rows[-1].state != telemetry.State.TUNE:
             return
         self._link.ask(Command("hold", self._who, "tuning session interrupted"))
-        while not self._rows or self._rows[-1].state == states.State.TUNE:
+        while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
             self._rows.clear()
             self._take()
-        while self._rows[0].state == states.State.TUNE:
+        while self._rows[0].state == telemetry.State.TUNE:
             self._rows.popleft()
 
     def catch_up(self) -> None:
@@ -243,7 +243,7 @@ class HoldRig:
         row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
-                f"the mirror is not held (state {states.State(int(row.state)).name.lower()}): {self._why()}; "
+                f"the mirror is not held (state {telemetry.State(int(row.state)).name.lower()}): {self._why()}; "
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)

@@ -10,10 +10,10 @@ from typing import Any
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
 from membrane_ctrl.alarms.senders import Outbox, Send, apprise_senders
 from membrane_ctrl.config.port import AlarmsConfig
-from membrane_ctrl.model import run_events, run_status
+from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEntered
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import RunStatus, TelemetryRow
 from membrane_ctrl.processes import child, ring
 
 # before its first tick a run connects its devices, with time-outs of its own
@@ -28,7 +28,7 @@ class Watcher:
         self._book = AlarmBook(config)
         self._outboxes = outboxes
         self._last_row_s = now_s + _STARTS_S
-        self._status = run_status.RunStatus()
+        self._status = RunStatus()
 
     @property
     def ended(self) -> bool:

@@ -20,7 +20,7 @@ from membrane_ctrl.calibration.session import (
 )
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.model import errors, events, run_events, states, telemetry
+from membrane_ctrl.model import errors, events, run_events, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress
 
 WHY = "calibration of the optics"
@@ -74,7 +74,7 @@ class Sweep:
             # the mean flow replaces the leak, whose own estimate needs a while of hold
             leak_um_per_s=_mean(leaks or [row.i_um_per_s for row in rows]),
             swing_adu=shape.modulation_median_adu,
-            shape_on=newest.shape_state != states.ShapeState.OFF,
+            shape_on=newest.shape_state != telemetry.ShapeState.OFF,
         )
 
     def claim(self, setpoint_um: float) -> None:
@@ -146,8 +146,8 @@ class Sweep:
             if isinstance(event, events.StateEntered):
                 self._why = f" ({event.why})"
         for row in news.rows:
-            if row.state != states.State.HOLD:
-                name = states.State(int(row.state)).name.lower()
+            if row.state != telemetry.State.HOLD:
+                name = telemetry.State(int(row.state)).name.lower()
                 raise HoldError(
                     f"the mirror is not held, but in state {name}{self._why}; start or resume the hold first"
                 )

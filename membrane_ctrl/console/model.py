@@ -8,7 +8,7 @@ from statistics import fmean, pstdev
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, go_on, is_paused, number, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
-from membrane_ctrl.model import events, run_events, run_status, shape_estimate, states, telemetry
+from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
 
 MINUTE_S = 60
 TREND_S = 240  # the widest terminal shows this much
@@ -53,7 +53,7 @@ SILENT_S = 1.0  # the control process hangs if no row comes for this long
 class ShapeView:
     """The last measurement cycle and the shape loop; `note` names any problem."""
 
-    state: states.ShapeState
+    state: telemetry.ShapeState
     estimate: shape_estimate.ShapeEstimate | None
     age_s: float
     sag_change_um: float  # since the reference: the first usable estimate of a settled hold
@@ -74,7 +74,7 @@ class ConsoleView:
     go_on: str  # how to go on, if that takes a person
     paused: bool
     silent_s: float  # age of the row if it deserves a warning, else 0
-    state: states.State
+    state: telemetry.State
     state_age_s: float
     elapsed_s: float
     left_s: float  # from the first tick; infinite for a run without an end
@@ -106,7 +106,7 @@ class ConsoleModel:
         self._ctl, self._keys = ctl, keys
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
-        self._status = run_status.RunStatus()
+        self._status = telemetry.RunStatus()
         self._started_s = math.nan
         self._error = Trend()
         self._lateness = Trend()
@@ -142,7 +142,7 @@ class ConsoleModel:
         self._cycles += 1
         if estimate.verdict == "rejected":
             self._rejected += 1
-        elif row is not None and row.state == states.State.HOLD:
+        elif row is not None and row.state == telemetry.State.HOLD:
             settled_s = self._status.since_s + telemetry.SETTLED_AFTER_S
             if estimate.time_s >= settled_s and (self._reference is None or self._reference.time_s < settled_s):
                 self._reference = estimate
@@ -159,7 +159,7 @@ class ConsoleModel:
             go_on=go_on(row, status.why, self._ctl, self._keys) if row else "",
             paused=row is not None and is_paused(row, status.why),
             silent_s=age_s if age_s > SILENT_S else 0.0,
-            state=states.State(int(row.state)) if row else states.State.STANDBY,
+            state=telemetry.State(int(row.state)) if row else telemetry.State.STANDBY,
             state_age_s=max(0.0, now_s - self._status.since_s),
             elapsed_s=now_s,
             left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
@@ -173,7 +173,7 @@ class ConsoleModel:
             faults=status.faults,
             last_fault=f"{_fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
             too_tight=self._too_tight(now_s),
-            gains=run_status.gains_words(status.loop or self._config.loop.model_dump(), status.trial_left_s),
+            gains=telemetry.gains_words(status.loop or self._config.loop.model_dump(), status.trial_left_s),
             recording=status.recording_words,
             events=tuple(self._events),
             shape=self._shape(now_s),
@@ -181,7 +181,7 @@ class ConsoleModel:
 
     def _too_tight(self, now_s: float) -> bool:
         row = self._status.row
-        judged = row is not None and row.state == states.State.HOLD and now_s - self._status.since_s >= JUDGE_S
+        judged = row is not None and row.state == telemetry.State.HOLD and now_s - self._status.since_s >= JUDGE_S
         return row is not None and judged and row.leak_um_per_s < TOO_TIGHT_UM_PER_S
 
     def _why(self) -> str:
@@ -192,9 +192,9 @@ class ConsoleModel:
 
     def _shape(self, now_s: float) -> ShapeView:
         estimate, since, row, status = self._estimate, self._reference, self._status.row, self._status
-        state = states.ShapeState(int(row.shape_state)) if row else states.ShapeState.OFF
+        state = telemetry.ShapeState(int(row.shape_state)) if row else telemetry.ShapeState.OFF
         reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
-        loop = status.shape_reason if state in (states.ShapeState.WAITING, states.ShapeState.SUSPENDED) else ""
+        loop = status.shape_reason if state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED) else ""
         return ShapeView(
             state=state,
             estimate=estimate,

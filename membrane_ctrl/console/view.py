@@ -13,7 +13,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
 from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
 from membrane_ctrl.console.why import NONE, duration, holders, number, percent
-from membrane_ctrl.model import states, telemetry
+from membrane_ctrl.model import telemetry
 
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
 
@@ -57,11 +57,11 @@ def full_scale(values: Sequence[float], least: float) -> float:
 
 
 _STATE_STYLES = {
-    states.State.HOLD: "bold green",
-    states.State.FAULT: "bold white on red",
-    states.State.LOWER: "bold yellow",
+    telemetry.State.HOLD: "bold green",
+    telemetry.State.FAULT: "bold white on red",
+    telemetry.State.LOWER: "bold yellow",
 }
-_SHAPE_STYLES = {states.ShapeState.TRACKING: "green", states.ShapeState.SUSPENDED: "yellow"}
+_SHAPE_STYLES = {telemetry.ShapeState.TRACKING: "green", telemetry.ShapeState.SUSPENDED: "yellow"}
 _VERDICT_STYLES = {"ok": "green", "degraded": "yellow", "rejected": "red"}
 _BAR_WIDTH = 10
 _CALM = 0.25  # of the band: on a finer scale noise would look like trouble
@@ -126,7 +126,7 @@ class ConsolePage:
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
-        held = view.state == states.State.HOLD
+        held = view.state == telemetry.State.HOLD
         return Panel(
             Group(*parts),
             title=title,

@@ -3,8 +3,7 @@
 import math
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.states import SafeLevel, State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 
 _LEVELS = {
     SafeLevel.HOLD_FLOW: "pump keeps its last mean flow",

@@ -17,7 +17,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.filters import DriftTracker
-from membrane_ctrl.model import shape_estimate, states
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 
 # The reference of the shape loop: the mean of the first shapes.
@@ -113,7 +113,7 @@ def sag_change(
 class ShapeOutput:
     """Output of the shape loop, with its reason."""
 
-    state: states.ShapeState
+    state: telemetry.ShapeState
     reason: str  # why it does not track, or what limits it; may be empty
     trim_um: float  # to be added to the setpoint
     # change of sag since lock as last admitted, and its standard deviation; NaN until there is one
@@ -128,7 +128,7 @@ class ShapeLoop:
     def __init__(self, config: ShapeConfig, sensitivity: FloatArray) -> None:
         self._config = config
         self._sensitivity = sensitivity
-        self._state = states.ShapeState.OFF
+        self._state = telemetry.ShapeState.OFF
         self._reason = "switched off"
         self._trim_um = 0.0
         self._base_um = 0.0
@@ -142,7 +142,7 @@ class ShapeLoop:
     @property
     def on(self) -> bool:
         """Whether it is switched on."""
-        return self._state != states.ShapeState.OFF
+        return self._state != telemetry.ShapeState.OFF
 
     def set_memory(self, time_constant_s: float) -> None:
         """Set the tracker's memory; the trim does not jump."""
@@ -150,14 +150,14 @@ class ShapeLoop:
 
     def switch(self, on: bool, now_s: float) -> None:
         """Switch on, taking a new reference from the present trim, or off, holding the trim."""
-        if on and self._state == states.ShapeState.OFF:
+        if on and self._state == telemetry.ShapeState.OFF:
             self.lock(now_s)
         elif not on:
-            self._state, self._reason = states.ShapeState.OFF, "switched off"
+            self._state, self._reason = telemetry.ShapeState.OFF, "switched off"
 
     def lock(self, now_s: float) -> None:
         """Take the figure from now on as the reference; hold the trim meanwhile."""
-        self._state, self._reason = states.ShapeState.WAITING, "waiting for the first shape"
+        self._state, self._reason = telemetry.ShapeState.WAITING, "waiting for the first shape"
         self._reference = ReferenceMean()
         self._change = SagChange(math.nan, math.nan)
         self._admitted_s, self._seen_s = math.nan, now_s
@@ -180,7 +180,7 @@ class ShapeLoop:
             self._settled_since_s = math.inf
         elif math.isinf(self._settled_since_s):
             self._settled_since_s = now_s
-        if self._state != states.ShapeState.OFF:
+        if self._state != telemetry.ShapeState.OFF:
             if estimate is not None:
                 self._seen_s = estimate.time_s
             refusal = distrust or self._refusal(now_s, estimate, displacement_um, settled)
@@ -188,7 +188,7 @@ class ShapeLoop:
                 self._refuse(refusal)
             elif estimate is not None:
                 self._admit(estimate)
-            if self._state == states.ShapeState.TRACKING:
+            if self._state == telemetry.ShapeState.TRACKING:
                 self._move_trim(now_s, dt_s)
         return ShapeOutput(
             self._state,
@@ -227,18 +227,18 @@ class ShapeLoop:
 
     def _refuse(self, reason: str) -> None:
         """Hold the trim and say why."""
-        if self._state != states.ShapeState.WAITING:
-            self._state = states.ShapeState.SUSPENDED
+        if self._state != telemetry.ShapeState.WAITING:
+            self._state = telemetry.ShapeState.SUSPENDED
         self._reason = reason
 
     def _admit(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Use an estimate: for the reference first, then for the drift, unless camera and laser disagree."""
-        if self._state == states.ShapeState.WAITING:
+        if self._state == telemetry.ShapeState.WAITING:
             self._admitted_s = estimate.time_s
             self._reference.take(estimate)
             self._reason = f"reference: shape {self._reference.count} of {self._reference.wanted}"
             if self._reference.complete:
-                self._state, self._reason = states.ShapeState.TRACKING, ""
+                self._state, self._reason = telemetry.ShapeState.TRACKING, ""
                 self._base_um = self._trim_um
                 self._drift.begin(self._reference.time_s)
             return
@@ -250,7 +250,7 @@ class ShapeLoop:
             return
         self._admitted_s, self._change = estimate.time_s, change
         self._drift.take(drift_um, estimate.time_s)
-        self._state, self._reason = states.ShapeState.TRACKING, ""
+        self._state, self._reason = telemetry.ShapeState.TRACKING, ""
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Move the trim to the drift, bounded in rate and range."""

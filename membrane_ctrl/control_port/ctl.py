@@ -13,7 +13,7 @@ from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
 from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
+from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         }
         lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
         if gains := status.get("gains"):
-            lines.append(f"  {'gains':15}{run_status.gains_words(gains, status.get('trial_left_s'))}")
+            lines.append(f"  {'gains':15}{telemetry.gains_words(gains, status.get('trial_left_s'))}")
         lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
         lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
     lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]

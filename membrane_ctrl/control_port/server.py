@@ -19,7 +19,7 @@ from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
 from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
 from membrane_ctrl.controller import commands, cross_check_plant, tick
-from membrane_ctrl.model import errors, events, run_events, run_status, states
+from membrane_ctrl.model import errors, events, run_events, telemetry
 
 # Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out another's `stop`
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
@@ -47,7 +47,7 @@ class Port:
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
-        self._status = run_status.RunStatus()
+        self._status = telemetry.RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._sessions: list[PortSession] = []
@@ -270,7 +270,7 @@ _REQUEST_S = 2.0
 _COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
-def metrics_text(status: run_status.RunStatus, clients: int, refused: int) -> str:
+def metrics_text(status: telemetry.RunStatus, clients: int, refused: int) -> str:
     """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
     lines: list[str] = []
 
@@ -283,7 +283,7 @@ def metrics_text(status: run_status.RunStatus, clients: int, refused: int) -> st
     add("recording_ok", "gauge", ("", not status.recording))
     row = status.row
     if row is not None:
-        add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in states.State))
+        add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State))
         for field, value in asdict(row).items():
             counter = _COUNTERS.get(field)
             add(counter or field, "counter" if counter else "gauge", ("", value))
@@ -313,19 +313,19 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
         await wire.close()
 
 
-def status_table(status: run_status.RunStatus) -> dict[str, Any]:
+def status_table(status: telemetry.RunStatus) -> dict[str, Any]:
     """The status for people and programs: names instead of codes, None for missing values."""
     row = status.row
     if row is None:
         return {"state": "starting", "why": "no tick has run yet"}
     fault, geometry = status.fault, status.geometry
     return {
-        "state": states.State(int(row.state)).name.lower(),
+        "state": telemetry.State(int(row.state)).name.lower(),
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
         "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
-        "safe_level": states.SafeLevel(int(row.safe_level)).name.lower(),
-        "shape": states.ShapeState(int(row.shape_state)).name.lower(),
+        "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
+        "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
         "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,
         "geometry": asdict(geometry) if geometry else None,

@@ -9,7 +9,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.model.events import CommandTaken
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 Kind = Literal[
     "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",

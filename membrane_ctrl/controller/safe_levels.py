@@ -11,7 +11,7 @@ from collections import deque
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import LimitsConfig, ResumeConfig, StatesConfig
 from membrane_ctrl.controller.safety import Observation, Rule
-from membrane_ctrl.model.states import SafeLevel
+from membrane_ctrl.model.telemetry import SafeLevel
 
 
 class SafeLevels:

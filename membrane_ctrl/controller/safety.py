@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 HOLDING = frozenset({State.HOLD})

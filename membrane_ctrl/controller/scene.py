@@ -12,7 +12,7 @@ from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.model import errors, states, telemetry
+from membrane_ctrl.model import errors, telemetry
 
 # for the record of a tick without an answer; its integers, which have no NaN, are unused
 _NO_READING = BenchReading(
@@ -114,7 +114,7 @@ class Scene:
 _MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 
 
-def obey(scene: Scene, command: commands.Command, state: states.State) -> None:
+def obey(scene: Scene, command: commands.Command, state: telemetry.State) -> None:
     """Take an accepted command's request into the scene; the controller does the rest."""
     match command.kind:
         case "hold":
@@ -131,12 +131,12 @@ def obey(scene: Scene, command: commands.Command, state: states.State) -> None:
             scene.hold_wanted = scene.acknowledged = False
         case "ack":
             scene.latched = ""
-            scene.acknowledged = state == states.State.FAULT
+            scene.acknowledged = state == telemetry.State.FAULT
         case "stop":
             scene.way_down = "stop"
             scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
-        case "vent" if state == states.State.FAULT:
-            scene.levels.enter(states.SafeLevel.VENT, scene.now_s)
+        case "vent" if state == telemetry.State.FAULT:
+            scene.levels.enter(telemetry.SafeLevel.VENT, scene.now_s)
         case "lower" | "vent":
             scene.way_down = scene.way_down or "lower"
             scene.venting |= command.kind == "vent"
@@ -146,7 +146,7 @@ def obey(scene: Scene, command: commands.Command, state: states.State) -> None:
 
 def telemetry_row(
     scene: Scene,
-    state: states.State,
+    state: telemetry.State,
     fault: int,
     number: int,
     inputs: tick.TickInputs,

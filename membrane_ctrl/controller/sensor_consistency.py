@@ -12,7 +12,7 @@ from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
-from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.model.telemetry import ShapeState, State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
 # No two cycles have the same noise; a shape that appears twice may be a repeated message

@@ -12,7 +12,7 @@ from membrane_ctrl.control.experiments.machine import BenchSample, Finished
 from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5

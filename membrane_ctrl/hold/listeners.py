@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import partial
 
 from membrane_ctrl.controller import commands, tick
-from membrane_ctrl.model import events, run_events, run_status, states
+from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
@@ -149,7 +149,7 @@ class SystemdNotify:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
         self._next_s = -math.inf
         self._state = -1.0
-        self._status = run_status.RunStatus()
+        self._status = telemetry.RunStatus()
 
     def __enter__(self) -> SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -173,7 +173,7 @@ class SystemdNotify:
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
         trouble = f", recording: {self._status.recording_words}" if self._status.recording else ""
-        self._send(f"{ready}WATCHDOG=1\nSTATUS={states.State(int(row.state)).name.lower()}{error}{fault}{trouble}")
+        self._send(f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{trouble}")
 
     def _send(self, message: str) -> None:
         if self._address:

@@ -12,7 +12,7 @@ from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.events import for_people
-from membrane_ctrl.model.run_status import RunStatus, gains_words
+from membrane_ctrl.model.telemetry import RunStatus, gains_words
 from membrane_ctrl.run_files import shapes, streams
 
 SUMMARY_PATH = "/summary"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, run_events, run_status, shape_estimate
+from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
@@ -153,7 +153,7 @@ class Recorder:
         self._events_file = events.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
-        self._status = run_status.RunStatus()
+        self._status = telemetry.RunStatus()
         for told in run_folder.read_events(run_dir, []) if resumes else ():
             self._status = self._status.after_event(told.event, told.mono_s)
         self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)

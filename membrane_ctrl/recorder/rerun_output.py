@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.recorder import blueprint, rerun_streams, sink
 from membrane_ctrl.run_files.disk_budget import DetailLevel
@@ -146,7 +146,7 @@ class RerunOutput:
             return
         state = telemetry.column(rows, "state")
         for row, code in telemetry.changes(state, self.state):
-            if code == states.State.HOLD:
+            if code == telemetry.State.HOLD:
                 self.shapes.rebase(float(telemetry.column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S)
         self.state = float(state[-1])
 

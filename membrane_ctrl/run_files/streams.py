@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from membrane_ctrl.controller import safety
-from membrane_ctrl.model import states
+from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column, FloatArray
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import Rows, column
@@ -245,9 +245,9 @@ def _words(codes: type[IntEnum]) -> dict[int, str]:
 
 # By column: the name of each code.
 WORDS: dict[str, dict[int, str]] = {
-    "state": _words(states.State),
-    "shape_state": _words(states.ShapeState),
-    "safe_level": _words(states.SafeLevel),
+    "state": _words(telemetry.State),
+    "shape_state": _words(telemetry.ShapeState),
+    "safe_level": _words(telemetry.SafeLevel),
     "fault": {0: "none"} | {rule.code: rule.name for rule in safety.TABLE},
 }
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, states, telemetry
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.events import EventLine
 
@@ -184,7 +184,7 @@ class Summary:
         for row, code in telemetry.changes(telemetry.column(rows, "state"), self._state):
             self._transitions += 1
             if len(self._states) < _LISTED_MAX:
-                self._states.append({"state": states.State(code).name.lower(), "mono_s": float(time_s[row])})
+                self._states.append({"state": telemetry.State(code).name.lower(), "mono_s": float(time_s[row])})
         parts = self._parts.of(telemetry.columns(rows))
         for name, part in parts.items():
             self._parts_s[name] += float(telemetry.column(rows, "dt_s")[part].sum())
@@ -296,7 +296,7 @@ class HoldParts:
 
     def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
         """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
-        time_s, hold = block["mono_s"], block["state"] == states.State.HOLD
+        time_s, hold = block["mono_s"], block["state"] == telemetry.State.HOLD
         faults = block["safe_level"] > 0
         # a loop that follows its error has a proportional part; a lost reading alone is no pause
         open_loop = (block["p_um_per_s"] == 0) & (block["error_um"] != 0) & np.isfinite(block["displacement_um"])
@@ -336,6 +336,6 @@ def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
     if not level["time_s"].size:
         return np.zeros(time_s.size, dtype=bool)
     place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)
-    hold = level["state"] == states.State.HOLD
+    hold = level["state"] == telemetry.State.HOLD
     since_s = np.maximum.accumulate(np.where(hold, -np.inf, np.append(level["time_s"][1:], np.inf)))
     return np.asarray(hold[place] & (time_s - since_s[place] >= telemetry.SETTLED_AFTER_S))

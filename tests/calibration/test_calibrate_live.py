@@ -15,7 +15,7 @@ from membrane_ctrl.calibration import live as command
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 
 WORDS = ["calibrate", "--live", "--no-pictures"]
 OLD = "a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"

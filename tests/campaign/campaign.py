@@ -30,7 +30,7 @@ from campaign_times import RATE_HZ
 from process_run import ProcessResult, process_table
 
 from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 SEEDS = range(1, 5)
 _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"

@@ -12,7 +12,7 @@ from campaign_world import WatchedPlant
 from firmware_iface.emulators.modbus_server import RegisterRefusal
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.virtual_bench import VirtualBench, at_once
 
 

@@ -32,7 +32,7 @@ from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import CommandTaken, Event
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile
 from tests.support.virtual_time import run_virtual as in_virtual_time
 

@@ -11,7 +11,7 @@ from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
 from campaign_world import World
 
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 
 def a_clock_that_stands() -> list[str]:

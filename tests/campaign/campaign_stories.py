@@ -16,7 +16,7 @@ from campaign_world import World
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.controller.scene import Scene
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 
 def an_acknowledgement_counts_once() -> list[str]:

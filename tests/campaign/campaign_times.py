@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from membrane_ctrl.model.states import SafeLevel
+from membrane_ctrl.model.telemetry import SafeLevel
 
 RATE_HZ = 25.0
 TICK_S = 1 / RATE_HZ

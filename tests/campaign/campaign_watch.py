@@ -29,7 +29,7 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _STILL = {State.STANDBY, State.LOWER}

@@ -30,8 +30,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import ROW_BYTES
+from membrane_ctrl.model.telemetry import ROW_BYTES, State
 from membrane_ctrl.processes.ring import RingWriter, ring
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 

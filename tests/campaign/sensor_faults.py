@@ -21,8 +21,7 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import SafeLevel, State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
 from membrane_ctrl.sim.plant import BenchEvent, Plant

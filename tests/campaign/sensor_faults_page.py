@@ -21,7 +21,7 @@ from scipy import stats
 from sensor_faults import CAMERA, FAULTS, PAIRS, SensorFault, Story, tell
 from sensor_quiet import QuietHours, quiet_hours
 
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 PAGE = Path(__file__).parents[2] / "docs" / "sensor-faults.md"
 SEED = 1

@@ -12,7 +12,7 @@ from campaign_run import run_case
 
 from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation, SafetyTable, Verdict
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 
 def case_called(name: str) -> Case:

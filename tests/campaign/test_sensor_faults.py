@@ -9,7 +9,7 @@ from sensor_faults import FAULTS, PAIRS, SensorFault, blocked, drift, scaled, st
 from sensor_quiet import quiet_hours
 
 from membrane_ctrl.config.schema import LimitsConfig
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 NOISE_ONLY = SensorFault("gauge", "shows only noise", blocked(0.5))
 

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.model.states import SafeLevel, ShapeState, State
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, ShapeState, State, TelemetryRow
 
 RATE_HZ = 50.0
 NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))

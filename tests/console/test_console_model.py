@@ -10,8 +10,7 @@ from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, text
-from membrane_ctrl.model.states import SafeLevel, ShapeState, State
-from membrane_ctrl.model.telemetry import SETTLED_AFTER_S
+from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, SafeLevel, ShapeState, State
 
 
 def model(duration_s: float | None = None) -> ConsoleModel:

@@ -10,8 +10,7 @@ from console_feed import HOLDING
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import holders, why
-from membrane_ctrl.model.states import SafeLevel, State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 
 CONFIG = Config()
 

@@ -13,7 +13,7 @@ from benchmarks.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.shape_loop import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES, ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 
 CONFIG = ShapeConfig(time_constant_s=60.0)
 PERIOD_S, DT_S = 2.0, 0.1

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.shape_loop import ON_S, SHAPE, track
 from membrane_ctrl.config.schema import TwinConfig
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 
 DRIFTING = TwinConfig(laser_drift_um_per_min=2.0, start_error_um=0.0)
 

@@ -20,8 +20,7 @@ from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listener
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event, EventLine
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
 
 PATIENCE_S = 10.0
 ROW = replace(TelemetryRow(*(0.0 for _ in FIELDS)), mono_s=12.0, tick=600.0, state=State.HOLD, error_um=0.25)

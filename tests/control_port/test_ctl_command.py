@@ -17,8 +17,7 @@ from membrane_ctrl.control_port.server import status_table
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_events import GeometryInForce, from_dict
-from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import RunStatus, State
 
 ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
 add_actions()

@@ -11,8 +11,7 @@ from port_run import ROW, port_run
 
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port.server import metrics_text
-from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.telemetry import FIELDS, RunStatus
 
 SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 

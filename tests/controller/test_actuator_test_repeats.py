@@ -10,7 +10,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.pump_obeys import ActuatorTest
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_record import run_virtual

@@ -6,7 +6,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, ShapeConfig
 from membrane_ctrl.controller.commands import TABLE, Command, refusal
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
 

@@ -17,7 +17,7 @@ from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import EventLine, Why
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_record import run_virtual

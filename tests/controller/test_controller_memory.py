@@ -18,7 +18,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import UnknownMemoryError, recall, remember
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.replay.replay import RecordedTick, replay
 from tests.support.incidents import check_incident, read_incident
 from tests.support.virtual_record import CONFIG, kept_ticks, laser_lost, memory_at, write_record

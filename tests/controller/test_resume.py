@@ -14,7 +14,7 @@ from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.scenario import CheckedScenario, Expectation, play

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import TelemetryRow
+from membrane_ctrl.model.telemetry import State, TelemetryRow
 from tests.support.scenario import CheckedScenario, play
 
 SEEN = ("filtered_um", "leak_um_per_s")

@@ -6,7 +6,7 @@ import pytest
 
 from membrane_ctrl.config.schema import StatesConfig
 from membrane_ctrl.controller.safe_levels import SafeLevels
-from membrane_ctrl.model.states import SafeLevel
+from membrane_ctrl.model.telemetry import SafeLevel
 
 CONFIG = StatesConfig(hold_flow_max_s=10.0, ramp_down_s=5.0, pump_off_max_s=100.0)
 

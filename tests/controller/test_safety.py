@@ -10,7 +10,7 @@ import pytest
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.safety import TABLE, Observation, Rule, SafetyTable
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 LIMITS = LimitsConfig()
 GOOD = Observation(

@@ -10,7 +10,7 @@ from membrane_ctrl.controller.sensor_consistency import HoldStatus, SensorConsis
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 
 SAG_UM = 37_100.0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from tests.support.scenario import CheckedScenario, Outcome, play
 
 

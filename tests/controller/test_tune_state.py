@@ -20,7 +20,7 @@ from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, 
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.plant import BenchEvent, Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench

@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model.errors import DeviceError, InputError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
 from tuning.rig import HoldRig
 

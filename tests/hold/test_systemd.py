@@ -18,8 +18,7 @@ from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import SystemdNotify
 from membrane_ctrl.model.run_events import from_dict
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
 
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
 UNIT = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"

@@ -10,8 +10,7 @@ import pytest
 from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review.events.found import find_events, noise_changes, weather_losses
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.nights import CONFIG, night, write_run
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table, verdict
 from membrane_ctrl.review.statistics.analysis import analyse

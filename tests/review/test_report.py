@@ -15,8 +15,7 @@ from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.states import ShapeState, State
-from membrane_ctrl.model.telemetry import COLUMN, SETTLED_AFTER_S, column, columns
+from membrane_ctrl.model.telemetry import COLUMN, SETTLED_AFTER_S, ShapeState, State, column, columns
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.html import render
 from membrane_ctrl.review.report.json import report_table

@@ -11,8 +11,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
-from membrane_ctrl.model.states import State
-from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, TelemetryRow, column, unpack
+from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
 from membrane_ctrl.run_files.summary import SCHEMA, Summary, held_at
 from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
 

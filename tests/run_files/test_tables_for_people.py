@@ -11,8 +11,7 @@ import pyarrow.csv
 import pytest
 
 from benchmarks.nights import night
-from membrane_ctrl.model.states import SafeLevel, State
-from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, State
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.export import export
 from membrane_ctrl.run_files.run import Run

@@ -8,7 +8,7 @@ from pathlib import Path
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.safety import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, TABLE, Rule
-from membrane_ctrl.model.states import SafeLevel, State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 
 _DOCS = Path(__file__).parents[2] / "docs"
 FAULTS = _DOCS / "faults.md"

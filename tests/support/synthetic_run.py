@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmarks.nights import messages_of
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.model.states import SafeLevel, ShapeState, State
-from membrane_ctrl.model.telemetry import TelemetryRow, unpack
+from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State, TelemetryRow, unpack
 
 RATE_HZ = 50.0
 STARTED_UTC = datetime(2026, 11, 21, 1, 23, 45, tzinfo=UTC)

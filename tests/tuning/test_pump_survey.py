@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.control.gas import PumpCurve
 from membrane_ctrl.model.errors import Exit, RejectedError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
 from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import command as tune

@@ -13,7 +13,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import Exit, RejectedError
-from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.bench_events import AmbientChange

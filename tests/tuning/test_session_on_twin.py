@@ -18,7 +18,7 @@ import pytest
 from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
 from membrane_ctrl.model.errors import Exit, InputError, RejectedError
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, open_session
 from tuning import command as tune
 from tuning import gains_file as journal

@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions import folder as plain
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection

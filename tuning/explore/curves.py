@@ -8,7 +8,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control import pid
-from membrane_ctrl.model import arrays, errors, states
+from membrane_ctrl.model import arrays, errors, telemetry
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder
 from tuning import gains_file, session
@@ -57,7 +57,7 @@ def of_run(path: Path, logs: Path) -> Workpiece:
     names = (*_COLUMNS, "state", "safe_level", "leak_um_per_s")
     blocks = list(run.tick_blocks(names))
     columns = {name: np.concatenate([block[name] for block in blocks] or [np.empty(0)]) for name in names}
-    quiet = (columns["state"] == states.State.HOLD) & (columns["safe_level"] == states.SafeLevel.NONE)
+    quiet = (columns["state"] == telemetry.State.HOLD) & (columns["safe_level"] == telemetry.SafeLevel.NONE)
     part = _longest(quiet, round(_LONGEST_S * loop.rate_hz))
     dt_s = 1.0 / loop.rate_hz
     if (part.stop - part.start) * dt_s < _SHORTEST_S:

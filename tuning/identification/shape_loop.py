@@ -18,7 +18,7 @@ from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.control.shape_loop import sag_change
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.model.states import ShapeState
+from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.records import Series
 from tuning.rig import HoldRig

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.events import laser_and_door as doors
 from membrane_ctrl.review.events import steps
 from membrane_ctrl.run_files import summary, tables

@@ -8,7 +8,7 @@ from scipy import ndimage, special
 
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files.shapes import Shapes
 
 # The noise is estimated over stretches of this many values: weather changes over a night.

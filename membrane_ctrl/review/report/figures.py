@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.report.json import timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any, Literal
 
 from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.states import State
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.words import beside, span

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from membrane_ctrl.model import errors, events, states
+from membrane_ctrl.model import errors, events, telemetry
 from membrane_ctrl.model.arrays import Column, Singles
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
@@ -219,7 +219,7 @@ def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
 
 
 def _leak(level: Block) -> tuple[float, float, float]:
-    leak = level["mean_leak_um_per_s"][level["state"] == states.State.HOLD]
+    leak = level["mean_leak_um_per_s"][level["state"] == telemetry.State.HOLD]
     leak = leak[np.isfinite(leak)]
     if not leak.size:
         return (math.nan, math.nan, math.nan)
@@ -228,9 +228,9 @@ def _leak(level: Block) -> tuple[float, float, float]:
 
 def _tracking(level: Block) -> float:
     """Share of the held time in which the shape loop moved the setpoint."""
-    state = level["shape_state"][level["state"] == states.State.HOLD]
+    state = level["shape_state"][level["state"] == telemetry.State.HOLD]
     state = state[np.isfinite(state)]
-    return float((state == states.ShapeState.TRACKING).mean()) if state.size else math.nan
+    return float((state == telemetry.ShapeState.TRACKING).mean()) if state.size else math.nan
 
 
 # Anomalies, by name and with the figure that shows them.

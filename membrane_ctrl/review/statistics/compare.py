@@ -8,7 +8,7 @@ from scipy import stats
 
 from membrane_ctrl.control.shape_loop import SHAPES
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.states import ShapeState, State
+from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
 from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p, windowed
 

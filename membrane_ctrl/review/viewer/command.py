@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from membrane_ctrl.model import errors, events, states, terminal
+from membrane_ctrl.model import errors, events, telemetry, terminal
 from membrane_ctrl.review import catalogue, words
 from membrane_ctrl.review.viewer import blueprints, viewer
 from membrane_ctrl.review.viewer.layer import ALL, Layer
@@ -245,5 +245,5 @@ def _hold_s(run: Run) -> float:
     for each in run.log:
         if isinstance(each.event, events.StateEntered) and each.event.state == "hold":
             return each.mono_s
-    held_s = level["time_s"][level["state"] == states.State.HOLD]
+    held_s = level["time_s"][level["state"] == telemetry.State.HOLD]
     return float(held_s[0]) if held_s.size else 0.0

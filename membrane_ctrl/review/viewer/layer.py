@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from membrane_ctrl.model import events, run_status
+from membrane_ctrl.model import events, telemetry
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
@@ -294,7 +294,7 @@ def prefix_of(label: str) -> str:
 
 def _summary_page(run: Run) -> str:
     """The page of figures as the recorder wrote it last, from `summary.json`: what `runs` and `report` state."""
-    status = run_status.RunStatus()
+    status = telemetry.RunStatus()
     for each in run.log:
         status = status.after_event(each.event, each.mono_s)
     try:
