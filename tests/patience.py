@@ -15,7 +15,7 @@ from unittest.mock import patch
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import check
 from membrane_ctrl.commissioning.check import DeviceProbe
-from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import DevicesConfig
 
 ANSWER_S = 20.0
 

@@ -12,8 +12,7 @@ from patience import patient_check
 
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.control_port.server import metrics_text
 from membrane_ctrl.model.telemetry import FIELDS, RunStatus, TelemetryRow

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.roles import LinkError
-from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, raw_frames, worker
+from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, raw_frames
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
@@ -136,7 +136,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     remote.report("preparing", "rendering the first picture, compiling")
     config, clock = spec.config, WaitingClock(spec.clock)
     geometry = file.geometry_of_run(spec.run_dir, config)
-    remote.tell(worker.geometry_event(geometry))
+    remote.tell(cycle.geometry_event(geometry))
     plan = _plan(config, geometry.optics)
     with ExitStack() as stack:
         if spec.truth is None:
@@ -151,7 +151,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
-        drift = worker.LiveDrift(geometry, config.shape.bin_px)
+        drift = cycle.LiveDrift(geometry, config.shape.bin_px)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot
@@ -175,7 +175,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
         remote.prepared()
         remote.report("running", "first cycle")
-        worker.keep_cycling(taking, remote, publish, clock, period_s, keep)
+        cycle.keep_cycling(taking, remote, publish, clock, period_s, keep)
 
 
 def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:

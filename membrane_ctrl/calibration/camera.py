@@ -19,7 +19,7 @@ from membrane_ctrl.geometry.spread_file import read_prior, write_prior
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology import full, reconstruct
-from membrane_ctrl.metrology.calibrate import artefact, ring_pose
+from membrane_ctrl.metrology.calibrate import ring_pose, solve
 from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calibrate_lens, on_screen
 from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
 from membrane_ctrl.metrology.checked import RejectedSetError, check
@@ -186,7 +186,7 @@ def calibrate_pose(options: PoseOptions) -> int:
         raise errors.RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {
-        "geometry": artefact.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
+        "geometry": solve.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
         "sigmas": sigmas,
     }
     write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)

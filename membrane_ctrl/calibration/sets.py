@@ -18,10 +18,10 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
-from membrane_ctrl.metrology.calibrate import artefact, drift, propagate, residuals, ring_pose, separable, verdict
+from membrane_ctrl.metrology.calibrate import drift, propagate, residuals, ring_pose, separable, verdict
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, slope_residual, solve
+from membrane_ctrl.metrology.calibrate.solve import Origin, Problem, Solution, slope_residual, solve, tables_of
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
@@ -253,7 +253,7 @@ def _write(
         drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
         for state, phases in zip(solution.states, problem.sets, strict=True)
     ]
-    origin = artefact.Origin(
+    origin = Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
         screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
@@ -262,7 +262,7 @@ def _write(
         condition=propagate.condition_number(solution),
         notes=tuple(finding.says for finding in findings),
     )
-    tables = artefact.tables_of(solution, bundle.optics, origin)
+    tables = tables_of(solution, bundle.optics, origin)
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry

@@ -15,9 +15,8 @@ from firmware_iface import role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import optical_bench, session
 from membrane_ctrl.alarms.senders import require_sendable
-from membrane_ctrl.config.devices import DevicesConfig
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force

@@ -14,8 +14,7 @@ from firmware_iface import conformance, drivers, roles
 from firmware_iface.links import aravis
 from firmware_iface.links.serial_port import serial_ports
 from membrane_ctrl.config import reference, toml_file
-from membrane_ctrl.config.devices import NEEDED, ROLES, DevicesConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import NEEDED, ROLES, Config, DevicesConfig
 from membrane_ctrl.instruments.bench import locked, modbus_names
 from membrane_ctrl.model import errors, terminal
 

@@ -11,7 +11,7 @@ import typer
 
 from firmware_iface import roles
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.config.devices import ROLES, DevicesConfig
+from membrane_ctrl.config.schema import ROLES, DevicesConfig
 from membrane_ctrl.model import errors
 
 _TEMPLATES = Path(__file__).parent / "scaffold"

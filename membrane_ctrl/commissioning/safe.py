@@ -14,8 +14,7 @@ from pathlib import Path
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchReading, LinkError
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile

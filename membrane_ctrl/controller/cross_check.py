@@ -14,8 +14,7 @@ from pydantic import BaseModel
 
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import VaisalaPtb330Config
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control import gas
 from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError

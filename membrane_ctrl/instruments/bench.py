@@ -21,7 +21,7 @@ from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.terminal import one_line
 

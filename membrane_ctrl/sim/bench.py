@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 from firmware_iface.emulators import pump_board
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config, PumpConfig, TwinConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.model import clock, errors, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.sim import lab, plant, sensors

@@ -14,7 +14,7 @@ from firmware_iface import drivers, settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators import lasers, modbus_server, pressure_gauges, pump_board, pumps, serial_device
 from firmware_iface.links import modbus_rtu, serial_port
-from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import bench
 
 _GATEWAY_NO_RESPONSE = 11

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.worker import LiveDrift, geometry_event
+from membrane_ctrl.acquisition.cycle import LiveDrift, geometry_event
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
 from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um

@@ -15,8 +15,7 @@ import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import LinkError
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.sim.lab import Lab
 from tests.support.gige_camera import GigeCameraEmulator

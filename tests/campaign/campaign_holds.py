@@ -184,8 +184,7 @@ class _Told:
 
 async def a_board_that_is_latched_at_the_start() -> list[str]:
     """The resume rule may clear a watchdog's trip at the start, and nothing else."""
-    from membrane_ctrl.config.devices import DevicesConfig
-    from membrane_ctrl.config.schema import ResumeConfig
+    from membrane_ctrl.config.schema import DevicesConfig, ResumeConfig
     from membrane_ctrl.hold.start import HoldOptions, _identify
 
     config, devices = Config(), DevicesConfig(board="tcp://127.0.0.1:1")

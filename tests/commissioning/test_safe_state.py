@@ -18,8 +18,7 @@ from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.instruments.bench import device_names, locked, pump_board
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.run_files.latched_fault import LatchedFile

@@ -25,8 +25,7 @@ from firmware_iface.roles import (
     LinkDownError,
     LinkWaitsError,
 )
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, LoopConfig, ShapeConfig
 from membrane_ctrl.control_port.server import Port
 from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller.controller import Controller

@@ -10,8 +10,7 @@ import pytest_asyncio
 
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.register_map import default_map
-from membrane_ctrl.config.devices import DevicesConfig
-from membrane_ctrl.config.schema import Config, ResumeConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latched
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.model.errors import DeviceError

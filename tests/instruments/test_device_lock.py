@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.config.devices import DevicesConfig
+from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments.bench import device_names, locked, modbus_names
 from membrane_ctrl.model.errors import DeviceError
 

@@ -11,9 +11,8 @@ import tomli_w
 from calibration_truth import OPTICS, make
 
 from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.calibrate.artefact import Origin, general_covariance, tables_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.solve import Solution, solve
+from membrane_ctrl.metrology.calibrate.solve import Origin, Solution, general_covariance, solve, tables_of
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
 from membrane_ctrl.model.plain_json import content_hash
