@@ -21,8 +21,8 @@ from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig,
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreReadings
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
-from membrane_ctrl.sim.bench_events import LeakChange
-from membrane_ctrl.sim.plant import BenchEvent, Plant
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import BenchEvent, LeakChange
 
 SETTLED_S = 40.0
 LOCK_S = 5.0  # from when on the optics are used

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from benchmarks.minimum_variance import WRITE_S, least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
-from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
-from membrane_ctrl.sim.plant import BenchEvent, Plant
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent, LeakChange
 
 SETTLED_S = 40.0
 SCENARIOS = ("quiet", "typical", "gusty")

@@ -16,7 +16,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import Child, pipe
 from membrane_ctrl.processes.frames import FrameRing
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
+from membrane_ctrl.sim.plant import TRUTH_BYTES, Truth
 
 WARM_CYCLES, CYCLES = 200, 1500
 _CONFIG = Config(

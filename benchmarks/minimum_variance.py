@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 from membrane_ctrl.config.schema import LoopConfig, TwinConfig
-from membrane_ctrl.sim.plant import SCENARIOS
+from membrane_ctrl.sim.surroundings import SCENARIOS
 
 TRANSPORT_S = 0.075  # the pump's tube
 WRITE_S = 0.005  # sample to write

@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.experiments.machine import BenchSample
-from membrane_ctrl.sim.plant import STEP_S, BenchEvent, Plant
+from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.surroundings import BenchEvent
 from tuning.identification.characterise import Characterised, characterise
 from tuning.identification.disturbance import observe
 from tuning.proposal.candidates import amigo, simc, ziegler_nichols

@@ -17,7 +17,7 @@ from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, newest_session, open_session
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress, live_hold
 from membrane_ctrl.sessions.live_log import LiveLog
-from membrane_ctrl.sim import plant, virtual_bench
+from membrane_ctrl.sim import plant, surroundings, virtual_bench
 from tuning import choice
 from tuning.identification.characterise import FULL, SHORT, Plan
 from tuning.proposal.verify import STAGES
@@ -158,7 +158,7 @@ class TwinHold:
     def __init__(
         self,
         config: Config,
-        events: Sequence[plant.BenchEvent] = (),
+        events: Sequence[surroundings.BenchEvent] = (),
         bench: virtual_bench.VirtualBench | None = None,
     ) -> None:
         self.config = config

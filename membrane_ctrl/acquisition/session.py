@@ -19,7 +19,7 @@ from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
-from membrane_ctrl.sim.sensors import Truth
+from membrane_ctrl.sim.plant import Truth
 
 # The twin's film, screen and camera, as the acquisition sees them.
 

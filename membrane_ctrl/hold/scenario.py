@@ -26,7 +26,7 @@ from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun
 from membrane_ctrl.run_files.run_folder import create_run_folder
-from membrane_ctrl.sim import bench_events, plant, virtual_bench
+from membrane_ctrl.sim import plant, surroundings, virtual_bench
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
 _FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
@@ -36,14 +36,14 @@ Happening = Literal[
     "ambient", "air_temperature", "leak", "laser_dropout", "laser_drift",
     "daily_temperature", "pressure_weather", "power_cycle",
 ]  # fmt: skip
-_MAKE: dict[str, Callable[[At], plant.BenchEvent]] = {
-    "ambient": lambda at: bench_events.AmbientChange(at.time_s, at.value, at.over_s),
-    "air_temperature": lambda at: bench_events.AirTemperatureChange(at.time_s, at.value, at.over_s),
-    "leak": lambda at: bench_events.LeakChange(at.time_s, at.value),
-    "laser_dropout": lambda at: bench_events.LaserDropout(at.time_s, at.over_s),
-    "laser_drift": lambda at: bench_events.LaserDrift(at.time_s, at.value, at.over_s or math.inf),
-    "daily_temperature": lambda at: bench_events.DailyTemperature(at.value),
-    "pressure_weather": lambda at: bench_events.PressureWeather(at.value),
+_MAKE: dict[str, Callable[[At], surroundings.BenchEvent]] = {
+    "ambient": lambda at: surroundings.AmbientChange(at.time_s, at.value, at.over_s),
+    "air_temperature": lambda at: surroundings.AirTemperatureChange(at.time_s, at.value, at.over_s),
+    "leak": lambda at: surroundings.LeakChange(at.time_s, at.value),
+    "laser_dropout": lambda at: surroundings.LaserDropout(at.time_s, at.over_s),
+    "laser_drift": lambda at: surroundings.LaserDrift(at.time_s, at.value, at.over_s or math.inf),
+    "daily_temperature": lambda at: surroundings.DailyTemperature(at.value),
+    "pressure_weather": lambda at: surroundings.PressureWeather(at.value),
 }
 
 

@@ -14,7 +14,7 @@ from firmware_iface.emulators import pump_board
 from membrane_ctrl.config.schema import Config, DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.model import clock, errors, terminal
 from membrane_ctrl.processes import child, ring
-from membrane_ctrl.sim import lab, plant, sensors
+from membrane_ctrl.sim import lab, plant, surroundings
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each sample is on time
 _STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
@@ -34,7 +34,7 @@ class BenchSpec:
     truth: ring.RingAddress | None = None  # where to publish `Truth.pack()` with every sample
     # how long the bench outlives the process that started it, so that the tripped watchdog can be observed
     linger_s: float = 5.0
-    events: tuple[plant.BenchEvent, ...] = ()  # events in plant time (0 at the start)
+    events: tuple[surroundings.BenchEvent, ...] = ()  # events in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
 
 
@@ -214,7 +214,7 @@ class TwinProcess:
 
         With `lab` it answers as the configured instruments, else as the pump board.
         """
-        truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, sensors.TRUTH_BYTES))
+        truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, plant.TRUTH_BYTES))
         spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = _started(spec, stack)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
@@ -229,7 +229,7 @@ class TwinProcess:
             message = reader.latest()
             if message is None:
                 return float("nan"), float("nan")
-            truth = sensors.Truth.unpack(message)
+            truth = plant.Truth.unpack(message)
             return truth.displacement_um, truth.laser_bias_um
 
         return newest

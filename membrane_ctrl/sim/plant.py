@@ -6,19 +6,90 @@ NumPy computes what does not depend on the state (surroundings, creep) for a blo
 """
 
 import math
+import struct
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import accumulate
-from typing import Protocol
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim import film, sensors
+from membrane_ctrl.sim import film
+from membrane_ctrl.sim.surroundings import BenchEvent, Disturbance
+
+# The true state, for the recording and the optics, never for the controller.
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """State of the simulated bench at one moment."""
+
+    time_s: float  # plant time; on the run's clock once the bench process has published it
+    displacement_um: float  # mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens
+    sag_mm: float  # depth of the mirror film
+    back_sag_mm: float  # depth of the other film
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+    gas_temperature_c: float
+    laser_bias_um: float  # error of the laser due to its mount
+    laser_lost: float  # 1 while the laser receives no light
+    leak_um_per_s: float  # speed at which the leak alone lowers the centre
+    pump_um_per_s: float  # speed at which the pump's flow lifts it
+    vent_um_per_s: float
+
+    def pack(self) -> bytes:
+        """The fields as doubles in their order."""
+        return _STRUCT.pack(*astuple(self))
+
+    @classmethod
+    def unpack(cls, message: bytes) -> "Truth":
+        """Inverse of `pack`. Raises struct.error on a message of another length."""
+        return cls(*_STRUCT.unpack(message))
+
+
+_STRUCT = struct.Struct(f"<{len(fields(Truth))}d")
+TRUTH_BYTES = _STRUCT.size
+
+
+GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 um of centre, so a monitor only
+LASER_GOOD = 0
+LASER_NO_LIGHT = 1
+
+
+class Sensors:
+    """Laser, barometer, gauge and thermometers with independent noise in each sample."""
+
+    def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
+        self._config = config
+        self._rng = rng
+        self._counter = 0
+
+    def read(self, truth: Truth) -> BoardSample:
+        """A new sample; the counter advances by one. Without light the displacement is NaN, its quality not 0."""
+        config = self._config
+        laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
+        lost = truth.laser_lost > 0
+        reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
+        self._counter += 1
+        return BoardSample(
+            displacement_um=float("nan") if lost else _quantised(reading_um, config.laser_resolution_um),
+            displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
+            gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
+            ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
+            air_temperature_c=truth.air_temperature_c + config.thermometer_noise_k * air,
+            gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
+            sample_counter=self._counter,
+            device_time_s=truth.time_s,
+        )
+
+
+def _quantised(value: float, resolution: float) -> float:
+    return round(value / resolution) * resolution if resolution > 0 else value
+
 
 # The diaphragm pump: adds gas only, sticks at low commands, responds late.
 
@@ -115,91 +186,6 @@ def _branches(config: PumpConfig, shape: str, full_ml_per_s: float) -> tuple[lis
     return rising.tolist(), falling.tolist()
 
 
-# Air pressure and temperature of a scenario, and the events on top, a block of steps at a time.
-
-
-Series = FloatArray
-# scenario: (air pressure std Pa, correlation time s), (air temperature std K, correlation time s)
-SCENARIOS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
-    "calm": ((0.0, 30.0), (0.0, 300.0)),
-    "quiet": ((0.2, 30.0), (0.010, 300.0)),
-    "typical": ((1.2, 30.0), (0.050, 300.0)),
-    "gusty": ((4.0, 20.0), (0.100, 300.0)),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """The bench's surroundings in each step of a block; arrays (steps,), filled in place."""
-
-    time_s: Series  # plant time of each step
-    ambient_pa: Series
-    air_k: Series
-    leak_factor: Series  # leak over its configured value
-    laser_bias_um: Series  # displacement of the laser's mount
-    laser_lost: Series  # 1 where the laser gets no light back, else 0
-
-
-class BenchEvent(Protocol):
-    """Something that happens to the bench at a time; picklable."""
-
-    def apply(self, on: Surroundings) -> None:
-        """Add the event's effect to the surroundings."""
-
-
-class OrnsteinUhlenbeck:
-    """Noise that forgets exponentially, exact at the steps, stationary from the first one.
-
-    x' = x exp(-dt/tau) + std sqrt(1 - exp(-2 dt/tau)) N(0, 1).
-    """
-
-    def __init__(self, std: float, correlation_s: float, step_s: float, rng: np.random.Generator) -> None:
-        self._decay = math.exp(-step_s / correlation_s)
-        self._kick = std * math.sqrt(-math.expm1(-2 * step_s / correlation_s))
-        self._rng = rng
-        self._value = std * float(rng.standard_normal())
-
-    def block(self, steps: int) -> Series:
-        """The next values, (steps,)."""
-        decay = self._decay
-        kicks = (self._kick * self._rng.standard_normal(steps)).tolist()
-        values = list(accumulate(kicks, lambda x, kick: decay * x + kick, initial=self._value))
-        self._value = values[-1]
-        return np.array(values[:-1])
-
-
-class Disturbance:
-    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
-
-    def __init__(
-        self, config: TwinConfig, events: Sequence[BenchEvent], step_s: float, rng: np.random.Generator
-    ) -> None:
-        pressure, temperature = SCENARIOS[config.scenario]
-        pressure_rng, temperature_rng = rng.spawn(2)
-        self._pressure = OrnsteinUhlenbeck(*pressure, step_s, pressure_rng)
-        self._temperature = OrnsteinUhlenbeck(*temperature, step_s, temperature_rng)
-        self._drift_um_per_s = config.laser_drift_um_per_min / 60
-        self._events = tuple(events)
-        self._step_s = step_s
-        self._next = 0
-
-    def block(self, steps: int) -> Surroundings:
-        """The next `steps` steps."""
-        time_s: Series = np.arange(self._next, self._next + steps, dtype=np.float64) * self._step_s
-        self._next += steps
-        block = Surroundings(
-            time_s=time_s,
-            ambient_pa=film.STANDARD_AMBIENT_PA + self._pressure.block(steps),
-            air_k=film.REFERENCE_K + self._temperature.block(steps),
-            leak_factor=np.ones(steps),
-            laser_bias_um=np.multiply(self._drift_um_per_s, time_s),
-            laser_lost=np.zeros(steps),
-        )
-        for event in self._events:
-            event.apply(block)
-        return block
-
-
 STEP_S = 0.005  # a thirtieth of the pump's lag, a fifteenth of its transport
 ZERO_C_K = 273.15
 VENT_OPEN_UM_PER_S = 100.0  # fully open at the nominal pressure (assumed): down by the whole sag within minutes
@@ -234,7 +220,7 @@ class Plant:
 
     def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:
         chance, noise = np.random.default_rng(twin.seed).spawn(2)
-        self._sensors = sensors.Sensors(twin, noise)
+        self._sensors = Sensors(twin, noise)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
         self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
         self._vent_ml_per_s_per_pa = VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
@@ -281,18 +267,18 @@ class Plant:
         """A sample of the sensors now; each call has its own noise."""
         return self.sample_of(self.truth())
 
-    def sample_of(self, truth: sensors.Truth) -> BoardSample:
+    def sample_of(self, truth: Truth) -> BoardSample:
         """A sample from a known truth."""
         return self._sensors.read(truth)
 
-    def truth(self) -> sensors.Truth:
+    def truth(self) -> Truth:
         """The true state."""
         i = self._index
         gas, ambient_pa = self._gas, self._ambient_pa[i]
         gauge_pa = gas.gauge_pressure_pa
         sag_mm = self._sag[i] * gas.root_pa
         um_per_ml = 1e3 * self._sag[i] * gas.root_pa_per_ml(ambient_pa, self._volume[i])
-        return sensors.Truth(
+        return Truth(
             time_s=self.time_s,
             displacement_um=1e3 * (sag_mm - film.NOMINAL_SAG_MM),
             sag_mm=sag_mm,

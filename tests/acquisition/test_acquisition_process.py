@@ -24,7 +24,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.frames import FrameReader, FrameRing
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
+from membrane_ctrl.sim.plant import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
 

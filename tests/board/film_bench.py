@@ -20,7 +20,7 @@ from firmware_iface.links.serial_port import SerialSettings
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.sim.bench import BenchSpec, LiveBench
-from membrane_ctrl.sim.sensors import Truth
+from membrane_ctrl.sim.plant import Truth
 from tests.board.film_wire import FilmWire
 from tests.board.qemu_board import built_image, qemu_board
 

@@ -39,7 +39,7 @@ from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
-from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
+from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 AFTERMATH_S = 45.0

@@ -14,17 +14,17 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
-from membrane_ctrl.sim import sensors as sensors_module
-from membrane_ctrl.sim.bench_events import (
+from membrane_ctrl.sim import plant as sensors_module
+from membrane_ctrl.sim.film import Film
+from membrane_ctrl.sim.surroundings import (
     AmbientChange,
+    BenchEvent,
     DailyTemperature,
     LaserDrift,
     LaserDropout,
     LeakChange,
     PressureWeather,
 )
-from membrane_ctrl.sim.film import Film
-from membrane_ctrl.sim.plant import BenchEvent
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _DROPOUT = "displacement_missing"  # five seconds without light are a true alarm

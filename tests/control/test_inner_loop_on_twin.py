@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.inner_loop import answer, hold, lost_reading, run, start_up, steady
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
+from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
 
 SEEDS = (1, 2, 3)
 ALL = "barometer and thermometer"

@@ -21,8 +21,8 @@ from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.bench_events import AmbientChange
-from membrane_ctrl.sim.plant import BenchEvent, Plant
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))

@@ -8,9 +8,9 @@ import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.sim import film, plant
-from membrane_ctrl.sim.bench_events import AirTemperatureChange, AmbientChange, LeakChange
 from membrane_ctrl.sim.film import filled, solve
 from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import AirTemperatureChange, AmbientChange, LeakChange
 
 TIGHT_S = 1e8  # trapped gas: the leak moves the centre 0.1 nm/s
 

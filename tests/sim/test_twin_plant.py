@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.bench_events import AmbientChange, LaserDrift, LaserDropout
-from membrane_ctrl.sim.plant import SCENARIOS, OrnsteinUhlenbeck, Plant
-from membrane_ctrl.sim.sensors import TRUTH_BYTES, Truth
+from membrane_ctrl.sim.plant import TRUTH_BYTES, Plant, Truth
+from membrane_ctrl.sim.surroundings import SCENARIOS, AmbientChange, LaserDrift, LaserDropout, OrnsteinUhlenbeck
 
 PUMP = PumpConfig()
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.sim.bench_events import DailyTemperature, PressureWeather
-from membrane_ctrl.sim.plant import BenchEvent, Surroundings
+from membrane_ctrl.sim.surroundings import BenchEvent, DailyTemperature, PressureWeather, Surroundings
 
 DAY_S = 86_400.0
 

@@ -22,7 +22,7 @@ from membrane_ctrl.control.experiments.machine import (
     quiet_stretch,
     steps,
 )
-from membrane_ctrl.sim.bench_events import AmbientChange, LaserDropout
+from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
 from tuning.identification.characterise import ExperimentError, characterise
 from tuning.identification.records import Record
 from tuning.rig import Rig, laser_noise_um

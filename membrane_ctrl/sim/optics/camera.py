@@ -156,7 +156,7 @@ def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[Floa
 
 
 class FilmPosition(Protocol):
-    """True position of the film; `membrane_ctrl.sim.sensors.Truth` is one."""
+    """True position of the film; `membrane_ctrl.sim.plant.Truth` is one."""
 
     @property
     def displacement_um(self) -> float:
