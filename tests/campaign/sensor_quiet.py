@@ -14,7 +14,7 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
-from membrane_ctrl.sim import plant as sensors_module
+from membrane_ctrl.sim import plant as plant_module
 from membrane_ctrl.sim.film import Film
 from membrane_ctrl.sim.surroundings import (
     AmbientChange,
@@ -55,7 +55,7 @@ def quiet_hours(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0
         return _quiet_hours(seed, hours, rate_hz, PumpConfig(), TwinConfig(seed=seed), 0.0)
     twin = TwinConfig(seed=seed, leak_time_constant_s=5000.0, barometer_noise_pa=0.1)
     thin = Film(thickness_um=42.0, creep_per_decade=0.02)
-    with patch.object(film_module, "MIRROR_FILM", thin), patch.object(sensors_module, "GAUGE_NOISE_PA", 1.0):
+    with patch.object(film_module, "MIRROR_FILM", thin), patch.object(plant_module, "GAUGE_NOISE_PA", 1.0):
         return _quiet_hours(seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3)
 
 
