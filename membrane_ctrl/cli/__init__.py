@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.cli import calibrating, configuring, ctl, holding, optics, reviewing
+from membrane_ctrl.cli import calibrating, ctl, holding, optics, reviewing
 from membrane_ctrl.model import errors, terminal
 
 # Markdown, because Rich's own markup takes [devices] in a help text for a style
@@ -82,5 +82,5 @@ def examples(name: Annotated[str, typer.Argument(help="File to print; by default
         raise errors.InputError(f"{name}: no such example; known: {', '.join(files)}")
 
 
-for _family in (holding, configuring, optics, calibrating, reviewing):
+for _family in (holding, optics, calibrating, reviewing):
     _family.add_commands(app)

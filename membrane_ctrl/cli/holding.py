@@ -1,4 +1,4 @@
-"""The commands that hold a mirror, talk to a hold, or look at devices."""
+"""The commands that write a configuration, look at its devices, hold a mirror with them, or talk to a hold."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +11,9 @@ from membrane_ctrl.model import clock, errors, terminal
 
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
+import textwrap
+from dataclasses import asdict
+from json import dumps
 
 twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 devices_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
@@ -22,13 +25,14 @@ FlatOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`."""
+    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `config`."""
     for command in (hold, safe, check, conformance):
         app.command()(command)
     app.add_typer(devices_app, name="devices")
     app.add_typer(twin_app, name="twin")
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
+    app.add_typer(config_app, name="config")
 
 
 def hold(
@@ -154,7 +158,7 @@ def new(
     to: Annotated[Path, typer.Option(help="Folder in which NAME-driver is made.")] = Path(),
 ) -> int:
     """Write a driver for an instrument of your own, with its emulator and tests, as a package to install."""
-    from membrane_ctrl.commissioning.new_device import write_package
+    from membrane_ctrl.commissioning.devices import write_package
 
     return write_package(name, role, to)
 
@@ -167,7 +171,7 @@ def conformance(
     json: JsonOption = False,
 ) -> int:
     """Test a pump board against its specification. The pump runs at a few per cent: vent the mirror first."""
-    from membrane_ctrl.commissioning.devices import run_conformance
+    from membrane_ctrl.commissioning.check import run_conformance
 
     return run_conformance(url, unit_id, json)
 
@@ -179,7 +183,7 @@ def alarm_test(
     json: JsonOption = False,
 ) -> int:
     """Send a test message to every address of the alarms."""
-    from membrane_ctrl.alarms.senders import send_test_alarm
+    from membrane_ctrl.alarms.process import send_test_alarm
 
     return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)
 
@@ -200,3 +204,66 @@ def _started(config: "Config", from_flat: bool) -> "Config":
     if not from_flat:
         return config
     return config.model_copy(update={"twin": config.twin.model_copy(update={"from_flat": True})})
+
+
+config_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Explain the keys of a configuration; write a first one."
+)
+_WIDTH = 100
+
+
+@config_app.command()
+def explain(
+    key: Annotated[
+        str,
+        typer.Argument(metavar="KEY", help="Key, table or driver: loop.kp_per_s, kp_per_s, devices.pump, ventus."),
+    ],
+    json: JsonOption = False,
+) -> int:
+    """Explain a key, or all keys of a table or driver: meaning, unit, range, default, when to change it."""
+    from membrane_ctrl.config.reference import explained
+
+    found = explained(key)
+    if json:
+        print(dumps({"schema": "membrane-config-keys/1", "tables": [asdict(table) for table in found]}))
+        return 0
+    for table in found:
+        print(textwrap.fill(f"{table.title}: {table.meaning}", _WIDTH))
+        for each in table.keys:
+            default = each.default if each.default == "required" else f"default {each.default}"
+            print(f"  {each.name}: {each.range} {each.unit}".rstrip() + f"; {default}")
+            print(textwrap.indent(textwrap.fill(f"{each.meaning} {each.advice}", _WIDTH), "    "))
+    return 0
+
+
+@config_app.command()
+def reference() -> int:
+    """Print every key of the configuration as one page of Markdown."""
+    from membrane_ctrl.config.reference import page
+
+    print(page(), end="")
+    return 0
+
+
+@config_app.command()
+def schema() -> int:
+    """Print the JSON schema of a configuration, for editors that complete and check TOML."""
+    from membrane_ctrl.config.reference import json_schema
+
+    print(dumps(json_schema(), indent=1))
+    return 0
+
+
+@config_app.command()
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; an existing one is kept.")] = Path(
+        "membrane-ctrl.toml"
+    ),
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Ask nothing: a configuration for `membrane-ctrl twin`.")
+    ] = False,
+) -> int:
+    """Write a first configuration, with what is connected; on a terminal, ask for the devices."""
+    from membrane_ctrl.commissioning.devices import write_first
+
+    return write_first(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)

@@ -1,7 +1,11 @@
-"""`check`: is the configuration valid, do its devices answer, and what would `hold` do with them?"""
+"""`check`: is the configuration valid, do its devices answer, and what would `hold` do with them?
+
+`conformance`: does a pump board keep its specification?
+"""
 
 import asyncio
 import contextlib
+import json
 import math
 import time
 from collections.abc import Awaitable, Callable
@@ -11,10 +15,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from firmware_iface import role_bench, roles
+from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import optical_bench, session
-from membrane_ctrl.alarms.senders import require_sendable
+from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
@@ -289,3 +293,28 @@ def _grab(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
         took_ms.append(1e3 * (time.monotonic() - begin_s))
         median_adu = float(np.median(pixels))
     return float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99)), median_adu
+
+
+def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
+    """`conformance`: test a board and report; exits with REJECTED if it fails.
+
+    Raises InputError for a bad URL, DeviceError if the board does not answer or another program uses it.
+    """
+    try:
+        with bench.locked(bench.modbus_names(url, unit_id)):
+            findings = asyncio.run(conformance.examine(url, unit_id))
+    except ValueError as error:
+        raise errors.InputError(str(error)) from None
+    except roles.LinkError as error:
+        raise errors.DeviceError(str(error)) from None
+    passed = not any(finding.problem for finding in findings)
+    if as_json:
+        checks = [asdict(finding) for finding in findings]
+        print(json.dumps({"schema": "membrane-conformance/1", "board": url, "passed": passed, "checks": checks}))
+    else:
+        table = Table("check", "result", "docs/firmware.md")
+        for finding in findings:
+            table.add_row(finding.check, finding.problem or "passed", finding.section)
+        terminal.table_console().print(table)
+        terminal.table_console().print("conforms" if passed else "does not conform: do not use it to run a pump")
+    return errors.Exit.DONE if passed else errors.Exit.REJECTED

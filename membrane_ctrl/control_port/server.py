@@ -17,7 +17,7 @@ from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
-from membrane_ctrl.control_port.session import FREE, Commander, Peer, PortSession, may_not
+from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, PortSession, may_not
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.model import errors, events, run_events, telemetry
 

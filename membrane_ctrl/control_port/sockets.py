@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
-from membrane_ctrl.control_port import endpoint, protocol, session
+from membrane_ctrl.control_port import endpoint, protocol
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model.errors import DeviceError, InputError, os_reason
 
@@ -52,12 +52,12 @@ class UnixListener:
             ) from None
         self._inode = path.stat().st_ino
 
-    def peer(self, connection: socket.socket) -> session.Peer:
+    def peer(self, connection: socket.socket) -> protocol.Peer:
         """Identity of the client, from the kernel."""
         raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         _, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
-        return session.Peer(f"unix:{self._names.get(uid, uid)}", role)
+        return protocol.Peer(f"unix:{self._names.get(uid, uid)}", role)
 
     def close(self) -> None:
         """Close it and remove the file, unless replaced by another; remove an empty folder made for it."""
@@ -145,14 +145,14 @@ class TlsListener:
         self.context = server_context(config)
         self.socket = listen_tcp(config.host, config.port, "port.tls")
 
-    def peer(self, certificate: dict[str, Any]) -> session.Peer:
+    def peer(self, certificate: dict[str, Any]) -> protocol.Peer:
         """Name and role in a certificate (from `getpeercert`); without a name, which commands record, read only."""
         subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
         name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
         if not name:
-            return session.Peer("tls:nameless", "read")
+            return protocol.Peer("tls:nameless", "read")
         who = f"tls:{name}".encode()[: protocol.WHO_BYTES].decode(errors="ignore")
-        return session.Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
+        return protocol.Peer(who, _ROLES.get(subject.get("organizationalUnitName", ""), "read"))
 
     def lasts_s(self, certificate: dict[str, Any]) -> float:
         """Remaining validity of the certificate: a connection must not outlive it."""

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from firmware_iface.drivers.pump_board import NO_CLAIM
 from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
-from membrane_ctrl.alarms.senders import require_sendable
+from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import commands, cross_check, safe_levels, tick

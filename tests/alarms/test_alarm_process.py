@@ -13,8 +13,15 @@ from types import ModuleType
 import pytest
 
 from membrane_ctrl.alarms.book import Notice
-from membrane_ctrl.alarms.process import AlarmsSpec, Watcher, watch
-from membrane_ctrl.alarms.senders import Outbox, apprise_senders, read_urls, require_sendable
+from membrane_ctrl.alarms.process import (
+    AlarmsSpec,
+    Outbox,
+    Watcher,
+    apprise_senders,
+    read_urls,
+    require_sendable,
+    watch,
+)
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock

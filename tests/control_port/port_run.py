@@ -14,8 +14,8 @@ from typing import Any
 from firmware_iface.roles import BenchCommand
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
+from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.server import Port, RunHooks
-from membrane_ctrl.control_port.session import Peer
 from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listeners_for
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.tick import TickOutputs

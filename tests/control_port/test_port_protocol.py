@@ -14,12 +14,13 @@ from membrane_ctrl.control_port.protocol import (
     WHO_BYTES,
     WHY_BYTES,
     Errand,
+    Peer,
     Request,
     RequestError,
     encode,
+    may_not,
     parse,
 )
-from membrane_ctrl.control_port.session import Peer, may_not
 from membrane_ctrl.controller.commands import TABLE, Kind
 from membrane_ctrl.hold.child_processes import EVENT_BYTES
 from membrane_ctrl.model.events import CommandTaken

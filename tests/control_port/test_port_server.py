@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from port_run import ROW, PortRun, client, port_run
 
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.protocol import MESSAGE_BYTES
-from membrane_ctrl.control_port.session import Peer
+from membrane_ctrl.control_port.protocol import MESSAGE_BYTES, Peer
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.run_events import from_dict

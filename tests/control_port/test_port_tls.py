@@ -15,7 +15,7 @@ from port_run import PortRun, port_run
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.session import Peer
+from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.sockets import TlsListener, client_context
 from membrane_ctrl.model.errors import DeviceError, InputError
 

@@ -13,7 +13,7 @@ from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table, verdict
 from membrane_ctrl.review.statistics.analysis import analyse
-from membrane_ctrl.review.statistics.windows import HeldTime
+from membrane_ctrl.review.statistics.spectra import HeldTime
 
 HOURS = 0.1
 

@@ -27,7 +27,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import Filter, entries, resolve, to_prune
-from membrane_ctrl.review.export import export
+from membrane_ctrl.review.runs import export
 from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.review.viewer.viewer import follow

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.review.export import export
+from membrane_ctrl.review.runs import export
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import ANNOTATIONS_FILE
 from tests.support.review_runs import written

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import special, stats
 
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.review.statistics.windows import group_starts
+from membrane_ctrl.review.statistics.spectra import group_starts
 
 # Iterations of g and of the variance absorbed by the line: three give short records the right coverage; more leave
 # the shortest records no degree of freedom, and so a meaningless interval.

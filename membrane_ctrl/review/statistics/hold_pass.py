@@ -9,7 +9,7 @@ import numpy as np
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.statistics import windows
+from membrane_ctrl.review.statistics import spectra
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 
@@ -23,28 +23,28 @@ class ThinSeconds:
 
     def __init__(self, rate_hz: float) -> None:
         self._least = summary.least_ticks(1.0, rate_hz)
-        self._parts: list[tuple[windows.Seconds, Column]] = []
+        self._parts: list[tuple[spectra.Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
         """Add (n,) times, setpoints and whether each tick is settled."""
         if not time_s.size:
             return
         second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = windows.group_starts(second)
+        starts = spectra.group_starts(second)
         rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
         sums = np.add.reduceat(rows, starts, axis=1)
         # a second shared by two blocks is thin in both
         thin = (sums[0] < self._least) & (sums[1] > 0)
         self._parts.append((second[starts][thin], sums[:, thin]))
 
-    def result(self) -> tuple[windows.Seconds, Column]:
+    def result(self) -> tuple[spectra.Seconds, Column]:
         """(k,) thin seconds with all ticks settled, (k,) their mean setpoint in um."""
         if not self._parts:
             return np.empty(0, dtype=np.int32), np.empty(0)
         second = np.concatenate([part[0] for part in self._parts])
         if not second.size:
             return second, np.empty(0)
-        starts = windows.group_starts(second)
+        starts = spectra.group_starts(second)
         ticks, settled, setpoint_um = np.add.reduceat(np.hstack([part[1] for part in self._parts]), starts, axis=1)
         thin = (ticks < self._least) & (settled == ticks)
         return second[starts][thin], setpoint_um[thin] / ticks[thin]
@@ -54,13 +54,13 @@ class ThinSeconds:
 class LevelMeans:
     """Means of (k,) thin seconds from the level: their ticks, errors in um, NaN where missing."""
 
-    second: windows.Seconds
+    second: spectra.Seconds
     ticks: Column
     reading_um: Column
     true_um: Column
 
 
-def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> LevelMeans:
+def level_means(run: Run, second: spectra.Seconds, setpoint_um: Column) -> LevelMeans:
     """Means of thin seconds from the 1 s level, as far as the level's are complete."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
     _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
@@ -72,7 +72,7 @@ def level_means(run: Run, second: windows.Seconds, setpoint_um: Column) -> Level
     return LevelMeans(second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row])
 
 
-def filled(seconds: windows.SecondsOf, means: LevelMeans, error_um: Column) -> windows.SecondsOf:
+def filled(seconds: spectra.SecondsOf, means: LevelMeans, error_um: Column) -> spectra.SecondsOf:
     """Sums over seconds, replacing thin ones by the level's.
 
     The error prevented by the feed-forward (the second row) needs every earlier tick: it is then unknown.
@@ -138,7 +138,7 @@ class HoldPass:
     true_um: Singles
     # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
     # sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known)
-    seconds: tuple[windows.SecondsOf, windows.SecondsOf]
+    seconds: tuple[spectra.SecondsOf, spectra.SecondsOf]
     raw_reading: summary.Moments
     raw_true: summary.Moments
     raw_in_band: float  # share of settled readings within the band
@@ -176,12 +176,12 @@ class _Collector:
         loop, self._band_um = run.config.loop, run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
         self._parts = summary.HoldParts(self._band_um)
-        self._without = windows.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
+        self._without = spectra.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
         self._grid_s = span_s[0]
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
-        self._seconds = windows.SecondSums(2), windows.SecondSums(2)
+        self._seconds = spectra.SecondSums(2), spectra.SecondSums(2)
         self._raw_reading, self._raw_true = summary.Moments(), summary.Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
@@ -189,7 +189,7 @@ class _Collector:
         self._lateness = summary.LogHistogram()
         self._pump = _PumpSums(loop.flow_max_um_per_s)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._times = {name: windows.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
+        self._times = {name: spectra.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
         self.thin = ThinSeconds(loop.rate_hz)
         # the running count at the start: for a part that of its first tick, which includes earlier ones
         self._missed_before = math.nan if from_within else 0.0

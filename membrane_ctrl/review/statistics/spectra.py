@@ -1,4 +1,4 @@
-"""Power spectral density of a series with gaps, and the RMS in its bands."""
+"""Statistics of a series with gaps: means over windows, power spectral density, RMS in its bands, Allan deviation."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,140 @@ import numpy as np
 from numba import njit
 from scipy import signal
 
-from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
+from membrane_ctrl.run_files.summary import least_ticks
+
+# A month has millions: single precision, which counts ticks exactly.
+Seconds = AnyArray
+Counts = Singles
+SecondsOf = tuple[Seconds, Counts, Column]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowStatistics:
+    """Statistics of means over windows of one length; NaN without windows; a single window has no `std_um`."""
+
+    window_s: float  # 0: single ticks
+    count: int
+    mean_um: float
+    std_um: float
+    max_um: float
+    p99_7_um: float
+    in_band: float  # share within the band
+
+
+def group_starts(number: AnyArray) -> IntArray:
+    """Starts of the runs of equal numbers."""
+    return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+
+
+class SecondSums:
+    """Sums over whole seconds of the run, of several series at once, from blocks in order of time."""
+
+    def __init__(self, series: int) -> None:
+        self._parts: list[SecondsOf] = []
+        self._series = series
+
+    def add(self, time_s: Column, values: Column) -> None:
+        """Take in (n,) times and (series, n) values, all finite or NaN together."""
+        if not time_s.size:
+            return
+        second = np.floor(time_s + 1e-9).astype(np.int32)
+        starts = group_starts(second)
+        counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
+        self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
+
+    def result(self) -> SecondsOf:
+        """(k,) seconds with ticks, (k,) numbers of ticks, (series, k) sums."""
+        if not self._parts:
+            return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
+        second, counts, sums = (np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True))
+        starts = group_starts(second)  # two blocks may share a second
+        return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
+
+
+def window_means(
+    second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
+) -> tuple[Column, Column]:
+    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of `SecondSums`."""
+    if not second.size:
+        return np.empty(0), np.empty(0)
+    number = second // window_s
+    starts = group_starts(number)
+    ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
+    whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
+    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
+
+
+def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
+    """Statistics of the means of windows."""
+    if not means_um.size:
+        return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
+    size_um = np.abs(means_um)
+    return WindowStatistics(
+        window_s,
+        int(means_um.size),
+        float(means_um.mean()),
+        float(means_um.std()) if means_um.size > 1 else math.nan,
+        float(size_um.max()),
+        float(np.quantile(size_um, 0.997)),
+        float((size_um <= band_um).mean()),
+    )
+
+
+# In quiet times segments have a few rows per second, some of them late.
+_ROWS_APART = 2.0
+_LEAST_GAP_S = 2.0
+
+
+class HeldTime:
+    """Sum of the tick intervals that start in a hold, over consecutive blocks.
+
+    `quiet_hz` is the lowest rate of recorded rows. A gap longer than two of its periods is a loss.
+    """
+
+    def __init__(self, quiet_hz: float) -> None:
+        self._longest_s = max(_LEAST_GAP_S, _ROWS_APART / quiet_hz)
+        self._last = (math.nan, False)
+        self.held_s = 0.0
+
+    def add(self, time_s: Column, held: BoolArray) -> None:
+        """Take in (n,) times and whether the mirror was held."""
+        if not time_s.size:
+            return
+        lasted_s = np.diff(np.concatenate(([self._last[0]], time_s)))
+        first = np.concatenate(([self._last[1]], held[:-1]))
+        self.held_s += float(lasted_s[first & (lasted_s <= self._longest_s)].clip(0.0).sum())
+        self._last = float(time_s[-1]), bool(held[-1])
+
+    def result_s(self, period_s: float) -> float:
+        """Seconds held; the last tick lasts for one more period."""
+        return self.held_s + (period_s if self._last[1] else 0.0)
+
+
+class WithoutFeedforward:
+    """Adds to the error what the feed-forward's flow prevented, from consecutive blocks.
+
+    The mirror's centre nearly integrates the flow. A speed v without feed-forward reaches the error through the
+    closed loop of a PI controller,
+
+        e / v = s / (s^2 + Kp s + Kp / Ti),
+
+    here by the bilinear transform. Dead time and pump lag (0.26 s together) are ignored: they hardly change the
+    effect of a disturbance of tens of seconds, and make the benefit appear slightly too small.
+    """
+
+    def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:
+        loop = [1.0, kp_per_s, kp_per_s / ti_s]
+        self._numerator, self._denominator = signal.bilinear([1.0, 0.0], loop, 1 / period_s)
+        self._state = np.zeros(2)
+
+    def kept_away_um(self, feedforward_um_per_s: Column) -> Column:
+        """(n,) um by which the error would have been larger; gaps count as zero flow."""
+        flow = np.nan_to_num(np.asarray(feedforward_um_per_s, dtype=np.float64))
+        kept, self._state = signal.lfilter(self._numerator, self._denominator, flow, zi=self._state)
+        return np.asarray(kept, dtype=np.float64)
+
 
 # Enough segments for an estimate good to a third, and segments only long enough for one more decade.
 _SEGMENTS = 8
