@@ -163,7 +163,7 @@ _OWN = {
     "sessions/folder.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
-    "review/export.py", "calibration/session.py", "calibration/camera.py",
+    "review/runs.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "geometry/spread_file.py", "commissioning/devices.py",
     # the project's own pages
     # shared memory
