@@ -18,7 +18,7 @@ from membrane_ctrl.sessions.folder import SessionFolder, open_session
 from membrane_ctrl.sessions.live_hold import HoldLink, Progress
 from tuning import gains_file, pump_trial, session
 from tuning.identification.loop_model import Gains
-from tuning.proposal import candidates, design, trade
+from tuning.proposal import candidates, design
 from tuning.rig import HoldRig
 
 
@@ -40,7 +40,7 @@ def chosen(folder: SessionFolder, rig: HoldRig, yes: bool, name: str, progress: 
     rows, now = session.offered(folder)
     model = session.found_of(folder).identified.model
     screen = terminal.table_console(stderr=True, width=None if sys.stderr.isatty() else 170)
-    screen.print(trade.shown(rows, f"proposed: {now.name}", model.leak_um_per_s))
+    screen.print(design.shown(rows, f"proposed: {now.name}", model.leak_um_per_s))
     if name:
         session.choose(folder, name)
     while not (name or yes):

@@ -16,7 +16,7 @@ from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
 from tuning.identification import characterise, identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel, observe
-from tuning.proposal import candidates, design, prediction, trade, verify
+from tuning.proposal import candidates, design, prediction, verify
 from tuning.rig import HoldRig
 
 OBSERVE_S = 600.0
@@ -52,7 +52,7 @@ class Design:
 
     candidates: tuple[design.Candidate, ...]
     least_std_um: float
-    preview: design.Preview
+    preview: prediction.Preview
     robustness: prediction.Robustness
 
 
@@ -60,8 +60,8 @@ class Design:
 class Previewed:
     """`preview.json`: present and proposed gains on the fitted twin, one row per seed."""
 
-    present: tuple[design.Preview, ...]
-    proposed: tuple[design.Preview, ...]
+    present: tuple[prediction.Preview, ...]
+    proposed: tuple[prediction.Preview, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +175,7 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         plant=PlantSection.of(found.identified),
         loop=made.loop,
     )
-    files.write_text_atomic(files.users(session.file("candidates.md")), trade.table(made.candidates) + "\n")
+    files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     folder.write(session.file("proposal.json"), kept)
     save_gains(session.file("gains.toml"), gains)
@@ -209,7 +209,7 @@ def choose(session: folder.SessionFolder, name: str) -> None:
     if name not in known:
         raise errors.InputError(f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}")
     row = known[name]
-    if why := trade.refusal(row):
+    if why := design.refusal(row):
         raise errors.InputError(f"{name}: is not applied: {why}")
     assert row.predicted is not None  # else refused
     path = session.file("gains.toml")
@@ -237,7 +237,7 @@ def preview_step(session: folder.SessionFolder) -> Previewed:
     session.begin("preview")
     pump, model = session.config.pump, found.identified.model
     present, proposed = (
-        tuple(design.preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
+        tuple(prediction.preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)

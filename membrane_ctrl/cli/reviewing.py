@@ -188,12 +188,12 @@ def replay(
 ) -> int:
     """Replay a run's inputs through today's control code and report differences (exit 3)."""
     from membrane_ctrl.replay.command import replay_command
-    from membrane_ctrl.review import catalogue, words
+    from membrane_ctrl.review import catalogue
     from membrane_ctrl.run_files.run import open_run
 
     with _files_of_the_run():
         folder = catalogue.resolve(run_dir)
-        from_s, to_s = words.part_s(open_run(folder).origin_utc, start, end)
+        from_s, to_s = catalogue.part_s(open_run(folder).origin_utc, start, end)
         return replay_command(folder, max(0.0, from_s), to_s, to_test, json)
 
 

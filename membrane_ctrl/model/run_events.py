@@ -1,5 +1,6 @@
 """Events of the processes around the controller, and reading of all kinds."""
 
+import json
 import math
 from typing import Any
 
@@ -274,6 +275,15 @@ class UnknownEvent(Event):
     def to_dict(self) -> EventLine:
         """The line, unchanged."""
         return dict(self.line)
+
+
+def parse(message: bytes) -> EventLine:
+    """The event in a ring message; anything but a JSON object becomes an event that says so."""
+    try:
+        event = json.loads(message)
+    except (ValueError, RecursionError):
+        event = None
+    return event if isinstance(event, dict) else {"kind": "unreadable_event", "message": repr(message[:200])}
 
 
 def from_dict(line: EventLine) -> Event:

@@ -14,7 +14,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
-from membrane_ctrl.run_files import events, run_folder, tables
+from membrane_ctrl.run_files import run_folder, tables
 from membrane_ctrl.run_files.summary import Summary
 
 # A ring as the recorder reads it: each message once, even when a new recorder continues after a killed one.
@@ -150,7 +150,7 @@ class Recorder:
         self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
         self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors, self._summary_page)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
-        self._events_file = events.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
+        self._events_file = sink.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._status = telemetry.RunStatus()
@@ -173,14 +173,14 @@ class Recorder:
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))
-        self.take_events([events.parse(message) for message in self._feeds["events"].drain()])
+        self.take_events([run_events.parse(message) for message in self._feeds["events"].drain()])
 
     def take_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""
         for event in new:
             self._summary.add_event(event)
             self._errors.guarded("status", partial(self._follow, event))
-            self.urgent |= event.get("kind") in events.URGENT
+            self.urgent |= event.get("kind") in sink.URGENT
             self.ended |= event.get("kind") == "end"
         self._events += new
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))

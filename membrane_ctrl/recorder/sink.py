@@ -1,4 +1,6 @@
-"""The Rerun file: segments, time axes, statics, and a flush that reports a dead writer.
+"""What the recorder writes to: `events.jsonl`, a line as soon as known, and the Rerun file.
+
+The Rerun file has segments, time axes, statics, and a flush that reports a dead writer.
 
 Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` continue silently, only
 `flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics and properties must be
@@ -9,9 +11,11 @@ times out, and then `save`, `disconnect`, the stream's destructor and Rerun's ow
 stream is kept untouched, and the process must end without exit handlers.
 """
 
+import os
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +25,9 @@ from rerun.chunk import RrdReader
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.files import sync_data
+from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
 from membrane_ctrl.run_files import segments, shapes, streams
@@ -245,3 +250,90 @@ class RecorderErrors:
         """Report as over all errors that start with `prefix` and are not in `but`: their cause has gone."""
         for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
             self.recovered(what)
+
+
+# What is on the disk at once: a power cut may follow.
+URGENT = frozenset({"fault", "end"})
+# Events that wait while the disk is full; a fault campaign makes a few hundred.
+_WAITING_MAX = 10_000
+
+
+class EventsFile:
+    """Appends events; after a failed write nothing is lost or torn, and the next call continues.
+
+    Parameters
+    ----------
+    path : Path
+    resumed : bool
+        After a killed recorder: remove a torn last line, and do not repeat existing lines.
+
+    Attributes
+    ----------
+    lost : int
+        Events dropped because too many waited on a full disk.
+    """
+
+    def __init__(self, path: Path, resumed: bool = False) -> None:
+        self._path = path
+        self._written = _mend_tail(path) if resumed else frozenset()
+        self._waiting: deque[bytes] = deque()
+        self._sync = False
+        self._descriptor: int | None = None
+        self.lost = 0
+
+    def append(self, events: Sequence[EventLine]) -> None:
+        """Write events, after those still waiting. Raises OSError (full disk)."""
+        for event in events:
+            line = dumps_checked(event).encode() + b"\n"
+            if line in self._written:
+                continue
+            self._waiting.append(line)
+            self._sync |= event.get("kind") in URGENT
+        while len(self._waiting) > _WAITING_MAX:
+            # the first line may already be half written: keep it, drop the second
+            del self._waiting[1]
+            self.lost += 1
+        self._write()
+
+    def _write(self) -> None:
+        if self._waiting and self._descriptor is None:
+            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        while self._waiting and self._descriptor is not None:
+            written = os.write(self._descriptor, self._waiting[0])
+            rest = self._waiting[0][written:]
+            if rest:
+                self._waiting[0] = rest
+            else:
+                self._waiting.popleft()
+        if self._sync and self._descriptor is not None:
+            os.fsync(self._descriptor)
+            self._sync = False
+
+    def begin_anew(self, recent: Sequence[EventLine]) -> None:
+        """Start a new file after the old one's removal, with the events written to it meanwhile. Raises OSError."""
+        gone = self._descriptor is not None  # not opened yet: nothing was lost
+        self.close()
+        self.append(recent if gone else [])
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+# A killed recorder saved its progress up to a second earlier: at most this many events may come twice.
+_TAIL_BYTES = 1_000_000
+
+
+def _mend_tail(path: Path) -> frozenset[bytes]:
+    """Cut a torn line off the end; return the last whole lines."""
+    if not path.exists():
+        return frozenset()
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _TAIL_BYTES))
+        tail = file.read()
+        whole = tail[: tail.rfind(b"\n") + 1]
+        file.truncate(size - len(tail) + len(whole))
+    return frozenset(whole.splitlines(keepends=True))

@@ -20,7 +20,7 @@ from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_t
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.words import beside, end_s, moment_s, not_in, number, one_line, part_s, span
+from membrane_ctrl.review.catalogue import beside, end_s, moment_s, not_in, number, one_line, part_s, span
 from membrane_ctrl.run_files.column_file import FOLDER
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.run_folder import add_mark

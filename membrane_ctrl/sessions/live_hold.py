@@ -19,7 +19,6 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import attach
-from membrane_ctrl.run_files import events
 from membrane_ctrl.sessions.live_log import LiveLog
 
 
@@ -135,7 +134,7 @@ class LiveHold:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
         return News(
             rows=tuple(telemetry.TelemetryRow.unpack(message) for message in messages.get("telemetry", ())),
-            events=tuple(run_events.from_dict(events.parse(message)) for message in messages.get("events", ())),
+            events=tuple(run_events.from_dict(run_events.parse(message)) for message in messages.get("events", ())),
             shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
         )
 

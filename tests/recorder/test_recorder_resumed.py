@@ -21,10 +21,9 @@ from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder, load_state, save_state
-from membrane_ctrl.recorder.sink import Recording, is_whole
+from membrane_ctrl.recorder.sink import EventsFile, Recording, is_whole
 from membrane_ctrl.replay.repair import read_rows
 from membrane_ctrl.run_files.disk_budget import DetailLevel
-from membrane_ctrl.run_files.events import EventsFile
 from tests.support.rrd_reading import has_footer, reader, scalars, strings
 from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.review.viewer.all_runs import PROPERTIES
+from membrane_ctrl.review.viewer.command import PROPERTIES
 from tests.support.review_runs import set_summary, written
 
 HELD = {"std_um": 0.1234567, "in_band": 0.98, "held_s": 300.0, "faults_s": 36.0, "paused_s": 0.0, "moving_s": 1.0}

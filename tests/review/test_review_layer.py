@@ -12,7 +12,8 @@ from rerun.chunk import RrdReader
 
 from benchmarks.nights import Planted
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.viewer.command import ReviewOptions, labels_of, make_review
+from membrane_ctrl.review.viewer.blueprints import labels_of
+from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.run_files import shapes
 from tests.support.review_runs import set_summary, written
 

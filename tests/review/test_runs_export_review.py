@@ -26,12 +26,11 @@ from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.catalogue import Filter, entries, resolve, to_prune
+from membrane_ctrl.review.catalogue import Filter, entries, moment_s, number, one_line, resolve, span, to_prune
 from membrane_ctrl.review.runs import export
 from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.review.viewer.viewer import follow
-from membrane_ctrl.review.words import moment_s, number, one_line, span
 from membrane_ctrl.run_files.segments import first_message_after
 from tests.support.review_runs import same, segment, set_summary, written
 

@@ -155,7 +155,7 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
     "processes/child.py",
-    "run_files/sealed_stream.py", "run_files/events.py", "recorder/recorder.py",
+    "run_files/sealed_stream.py", "recorder/recorder.py",
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run

@@ -30,7 +30,7 @@ from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
 from tuning.explore.page import saver
 from tuning.identification import disturbance, loop_model, records
 from tuning.identification.characterise import SHORT
-from tuning.proposal import design
+from tuning.proposal import prediction
 from tuning.rig import Rig
 
 PLANT = loop_model.PlantModel(0.9, 0.4, 0.3, 1.2)
@@ -70,7 +70,7 @@ def test_the_load_peak_is_that_of_the_real_loop() -> None:
     gains = GAINS[0]
     shown = curves("yours", gains, MADE, 60.0)
     loop = gains.applied_to(LOOP)
-    seen = design.preview(loop, PumpConfig(), PLANT, MADE.weather, duration_s=40.0)
+    seen = prediction.preview(loop, PumpConfig(), PLANT, MADE.weather, duration_s=40.0)
     assert np.abs(shown.load_um).max() == pytest.approx(seen.load_peak_um, rel=0.05)
 
 
@@ -89,7 +89,7 @@ def test_the_sliders_begin_where_the_gains_are() -> None:
 
 
 def quiet_hold(seed: int = 3) -> records.Record:
-    bench = design.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
+    bench = prediction.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
     rig = Rig(bench, LOOP, PumpConfig(), PLANT.holding_flow_um_per_s)
     rig.hold(30.0)
     return rig.hold(260.0)

@@ -27,8 +27,7 @@ from tuning.choice import compared as compare
 from tuning.gains_file import load_gains
 from tuning.identification.loop_model import Gains, margins
 from tuning.opening import TwinHold
-from tuning.proposal.design import NAMES
-from tuning.proposal.trade import against
+from tuning.proposal.design import NAMES, against
 from tuning.rig import HoldRig
 
 CONFIG = """

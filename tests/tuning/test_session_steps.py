@@ -22,7 +22,7 @@ from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGa
 from tuning.identification.loop_model import PlantModel
 from tuning.identification.records import Record, load_record, save_record
 from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
-from tuning.proposal.design import ModelBench
+from tuning.proposal.prediction import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
 from tuning.rig import Rig
 

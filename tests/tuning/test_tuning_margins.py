@@ -21,8 +21,8 @@ from tuning.proposal.candidates import (
     max_ki,
     simc,
 )
-from tuning.proposal.design import designs, preview
-from tuning.proposal.prediction import Walks, least_std_um, predict
+from tuning.proposal.design import designs
+from tuning.proposal.prediction import Walks, least_std_um, predict, preview
 
 DT_S = 1e-3
 DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay

@@ -14,9 +14,8 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
-from tuning.proposal.design import NAMES, PRESENT, ModelBench, RefusedError, preview, propose
-from tuning.proposal.prediction import robustness, sampled_plants
-from tuning.proposal.trade import table
+from tuning.proposal.design import NAMES, PRESENT, RefusedError, propose, table
+from tuning.proposal.prediction import ModelBench, preview, robustness, sampled_plants
 from tuning.rig import Rig
 
 RATIO_MAX = {

@@ -1,136 +1,18 @@
-"""Turns identified models into a proposal: all candidates side by side, and the proposed one."""
+"""Turns identified models into a proposal: candidates side by side, their gains and costs, and the proposed one."""
 
 import math
-from collections import deque
 from dataclasses import dataclass, replace
 
-import numpy as np
+from pydantic import ValidationError
+from rich.console import Group
+from rich.table import Table
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control import gas
-from membrane_ctrl.control.experiments.machine import BenchSample
-from tuning.identification import characterise, identify, loop_model, records
+from tuning.gains_file import MS_MAX
+from tuning.identification import characterise, identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal import candidates as rules
 from tuning.proposal import prediction
-from tuning.rig import Rig
-
-# The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.
-#
-# Linear prediction ignores that the pump only adds gas, stalls and starts. Here the real loop drives a pump
-# with the configured curve in front of the identified delay, lag, gain and leak, in the identified weather.
-
-_SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
-_SETTLE_S = 30.0
-_LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # arbitrary: only changes matter
-
-
-class ModelBench:
-    """A simulated bench made from the identified models; equal seeds give equal weather.
-
-    `leak_step` has the time in s and the size in um/s of a step of the leak.
-    """
-
-    def __init__(
-        self,
-        model: loop_model.PlantModel,
-        disturbance: DisturbanceModel,
-        pump: PumpConfig,
-        seed: int,
-        leak_step: tuple[float, float] = (math.inf, 0.0),
-    ) -> None:
-        self._model, self._disturbance, self._pump = model, disturbance, pump
-        self._curve = gas.branch(pump, pump.curve_um_per_s)
-        self._leak_step = leak_step
-        self._rng = np.random.default_rng(seed)
-        self._dt_s = disturbance.rest.dt_s
-        self._step_s = self._dt_s / _SUBSTEPS
-        flow = model.holding_flow_um_per_s
-        self._tube = deque([flow] * (1 + round(model.dead_time_s / self._step_s)))
-        self._arriving = flow
-        self._running = True
-        self._way_um = 0.0
-        self._walks = prediction.Walks.of(disturbance)
-        self._transition, kicks = self._walks.over(self._dt_s)
-        sizes, ways = np.linalg.eigh(kicks)
-        self._kicks = ways * np.sqrt(np.maximum(sizes, 0.0))
-        self._weather = np.zeros(len(kicks))
-        self._ticks = 0
-        self.true_um: list[float] = []
-
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
-        """Run one tick. The vent is assumed as during the identification of the leak."""
-        pump = self._pump
-        self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
-        flow = self._curve.flow(pump_fraction) if self._running else 0.0
-        at_s, size = self._leak_step
-        leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
-        follow = -math.expm1(-self._step_s / self._model.lag_s)
-        for _ in range(_SUBSTEPS):
-            self._tube.append(flow)
-            self._arriving += (self._tube.popleft() - self._arriving) * follow
-            self._way_um += (self._model.gain * self._arriving - leak) * self._step_s
-        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(self._weather.size)
-        return self._read()
-
-    def _read(self) -> BenchSample:
-        of, walks = self._disturbance, self._walks
-        true_um = self._way_um + float(walks.centre @ self._weather)
-        self.true_um.append(true_um)
-        self._ticks += 1
-        laser, pressure, temperature = self._rng.standard_normal(3).tolist()
-        return BenchSample(
-            true_um + of.laser_um * laser,
-            _LEVEL_PA + float(walks.barometer @ self._weather) + of.barometer.noise * pressure
-            if of.barometer
-            else math.nan,
-            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature if of.air else math.nan,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Preview:
-    """Result on the fitted twin."""
-
-    std_um: float  # of the true centre
-    bias_um: float  # target minus true centre
-    # After a step of the leak, weather off: furthest excursion, and time until the centre stays within `RECOVERED_UM`
-    load_peak_um: float
-    recovery_s: float
-
-
-def preview(
-    loop: LoopConfig,
-    pump: PumpConfig,
-    model: loop_model.PlantModel,
-    disturbance: DisturbanceModel,
-    seed: int = 1,
-    duration_s: float = 180.0,
-    load_step_um_per_s: float = 0.6,
-) -> Preview:
-    """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
-    true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
-    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=())
-    calm = DisturbanceModel(noise, None, None)
-    stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
-    answer_um = _held(loop, pump, model, stepped, 120.0)
-    away = np.flatnonzero(np.abs(answer_um) > loop_model.RECOVERED_UM)
-    return Preview(
-        std_um=float(true_um.std()),
-        bias_um=-float(true_um.mean()),
-        load_peak_um=float(np.abs(answer_um).max()),
-        recovery_s=float((away[-1] + 1) / loop.rate_hz) if away.size else 0.0,
-    )
-
-
-def _held(
-    loop: LoopConfig, pump: PumpConfig, model: loop_model.PlantModel, bench: ModelBench, duration_s: float
-) -> records.Series:
-    """True centre after settling."""
-    rig = Rig(bench, loop, pump, model.holding_flow_um_per_s)
-    rig.hold(_SETTLE_S + duration_s)
-    return np.array(bench.true_um)[round(_SETTLE_S * loop.rate_hz) :]
-
 
 # The Ziegler-Nichols relay on this loop sees a limit cycle where the phase is -180 deg, w d = pi / 2:
 # Ku = pi / (2 k d), Tu = 4 d. Noise makes theirs even larger.
@@ -168,7 +50,7 @@ class Proposal:
     chosen: Candidate
     candidates: tuple[Candidate, ...]  # including the chosen one and the present gains
     least_std_um: float  # the lower bound
-    preview: Preview  # of the chosen one on the fitted twin
+    preview: prediction.Preview  # of the chosen one on the fitted twin
     robustness: prediction.Robustness
 
 
@@ -287,6 +169,99 @@ def propose(
         chosen=chosen,
         candidates=(chosen, row(PRESENT, loop_model.Gains.of(loop), loop), *designed[1:]),
         least_std_um=prediction.least_std_um(model, disturbance, settled),
-        preview=preview(proposed, pump, model, disturbance),
+        preview=prediction.preview(proposed, pump, model, disturbance),
         robustness=prediction.robustness(chosen.gains, identified, disturbance, settled),
     )
+
+
+HEADS = ("candidate", "K 1/s", "Ti s", "filter s", "std um", "load peak um", "recovery s", "Ms", "against present")
+MARGIN_HEADS = ("Td s", "/ least", "flow std um/s", "GM", "PM deg", "delay margin s", "disk margin")
+_WORDS = {"std_um": "std", "load_peak_um": "load peak", "load_recovery_s": "recovery", "ms": "Ms"}
+_DIGITS = {"std_um": 3, "load_peak_um": 2, "load_recovery_s": 1, "ms": 2}
+_ALIKE = 0.02  # a smaller change is none
+
+
+def cells(rows: tuple[Candidate, ...]) -> list[tuple[str, ...]]:
+    """The cells under `HEADS`, the present gains first."""
+    present = next((row for row in rows if row.name == PRESENT), None)
+    ordered = sorted(rows, key=lambda row: row is not present)
+    return [(row.name, *_gains(row), *_figures(row), against(row, present)) for row in ordered]
+
+
+def table(rows: tuple[Candidate, ...]) -> str:
+    """The candidates as a Markdown table, with all margins."""
+    heads = (*HEADS, *MARGIN_HEADS)
+    margins = {row.name: _margins(row) for row in rows}
+    lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *((*line, *margins[line[0]]) for line in cells(rows))]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def shown(rows: tuple[Candidate, ...], title: str, leak_um_per_s: float) -> Group:
+    """The candidates for a terminal of 80 columns; `leak_um_per_s` is what the mirror loses now."""
+    figures = Table(title=title, box=None, padding=(0, 1, 0, 0))
+    words = Table("", "against the present gains", box=None, padding=(0, 1, 0, 0))
+    for number, head in enumerate(HEADS[:-1]):
+        figures.add_column("\n".join(head.rsplit(" ", 1)), justify="right" if number else "left", no_wrap=True)
+    for line in cells(rows):
+        figures.add_row(*(cell.replace(" +- ", "+-") for cell in line[:-1]))
+        words.add_row(line[0], line[-1])
+    step = rules.Demands().load_step_um_per_s
+    caption = (
+        f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
+        "+-: 1 sigma of the fit; for std with ten other minutes of weather like the observed, which change every std "
+        "alike."
+    )
+    return Group(figures, "", words, "", caption)
+
+
+def against(row: Candidate, present: Candidate | None) -> str:
+    """What gets better and what gets worse than with the present gains, as factors; or why it is not offered."""
+    if row is present:
+        return "in force"
+    if why := refusal(row):
+        return f"not offered: {why}"
+    if present is None or present.predicted is None:
+        return "the present gains are unstable"
+    better: list[str] = []
+    worse: list[str] = []
+    for name, word in _WORDS.items():
+        now, then = getattr(present.figures, name), getattr(row.figures, name)
+        if not math.isclose(now, then, rel_tol=_ALIKE):
+            factor = f" x {then / now:.2f}" if 0 < now < math.inf and then < math.inf else ""
+            (better if then < now else worse).append(word + factor)
+    return "; ".join(f"{word}: {', '.join(said)}" for word, said in (("better", better), ("worse", worse)) if said)
+
+
+def refusal(row: Candidate) -> str:
+    """Why these gains must not be applied; empty if they may."""
+    if row.predicted is None:
+        return "unstable"
+    if row.margins.ms > MS_MAX:
+        return f"Ms {row.margins.ms:.2f}, the limit is {MS_MAX:g}"
+    try:
+        row.gains.applied_to(LoopConfig())
+    except ValidationError:
+        return "outside the range of the configuration"
+    return ""
+
+
+def _gains(row: Candidate) -> tuple[str, ...]:
+    gains = row.gains
+    return f"{gains.kp_per_s:.3f}", f"{gains.ti_s:.2f}", f"{gains.filter_s:.2f}"
+
+
+def _figures(row: Candidate) -> list[str]:
+    if row.predicted is None:
+        return ["unstable", "", "", ""]
+    found = [f"{getattr(row.figures, name):.{digits}f}" for name, digits in _DIGITS.items()]
+    if row.sigma is None:
+        return found
+    sigmas = [f"{getattr(row.sigma, name):.{digits}f}" for name, digits in _DIGITS.items()]
+    return [f"{value} +- {sigma}" for value, sigma in zip(found, sigmas, strict=True)]
+
+
+def _margins(row: Candidate) -> tuple[str, ...]:
+    m, p = row.margins, row.predicted
+    predicted = (f"{row.ratio:.2f}", f"{p.flow_std_um_per_s:.2f}") if p is not None else ("", "")
+    margins = f"{m.gain_margin:.1f}", f"{m.phase_margin_deg:.0f}", f"{m.delay_margin_s:.2f}", f"{m.disk_margin:.2f}"
+    return (f"{row.gains.td_s:.2f}", *predicted, *margins)

@@ -1,22 +1,26 @@
-"""Standard deviations: the prediction for a design, and the lower bound for any controller.
+"""What a design will do: the predicted standard deviations, the lower bound for any controller, and a preview.
 
 Predicted: the true centre is S d - T n for a disturbance d and laser noise n; its variance is the integral of its
 spectrum. Bound: no controller acts before the dead time, so the error is at least that of the best prediction of the
 disturbance over it (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The pump's lag is no limit:
-it can be inverted.
+it can be inverted. Preview: the real one-sided pump on the fitted plant.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control import gas
+from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification import identify, loop_model
+from tuning.identification import identify, loop_model, records
 from tuning.identification.disturbance import DisturbanceModel
+from tuning.rig import Rig
 
 Matrix = FloatArray
 
@@ -192,3 +196,120 @@ def robustness(
     # the next value above: interpolating between a number and infinity is impossible
     peak_p95, std_p95 = (float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds))
     return Robustness(peak_p95, std_p95, float(stable.mean()))
+
+
+# The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.
+#
+# Linear prediction ignores that the pump only adds gas, stalls and starts. Here the real loop drives a pump
+# with the configured curve in front of the identified delay, lag, gain and leak, in the identified weather.
+
+_SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
+_SETTLE_S = 30.0
+_LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # arbitrary: only changes matter
+
+
+class ModelBench:
+    """A simulated bench made from the identified models; equal seeds give equal weather.
+
+    `leak_step` has the time in s and the size in um/s of a step of the leak.
+    """
+
+    def __init__(
+        self,
+        model: loop_model.PlantModel,
+        disturbance: DisturbanceModel,
+        pump: PumpConfig,
+        seed: int,
+        leak_step: tuple[float, float] = (math.inf, 0.0),
+    ) -> None:
+        self._model, self._disturbance, self._pump = model, disturbance, pump
+        self._curve = gas.branch(pump, pump.curve_um_per_s)
+        self._leak_step = leak_step
+        self._rng = np.random.default_rng(seed)
+        self._dt_s = disturbance.rest.dt_s
+        self._step_s = self._dt_s / _SUBSTEPS
+        flow = model.holding_flow_um_per_s
+        self._tube = deque([flow] * (1 + round(model.dead_time_s / self._step_s)))
+        self._arriving = flow
+        self._running = True
+        self._way_um = 0.0
+        self._walks = Walks.of(disturbance)
+        self._transition, kicks = self._walks.over(self._dt_s)
+        sizes, ways = np.linalg.eigh(kicks)
+        self._kicks = ways * np.sqrt(np.maximum(sizes, 0.0))
+        self._weather = np.zeros(len(kicks))
+        self._ticks = 0
+        self.true_um: list[float] = []
+
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
+        """Run one tick. The vent is assumed as during the identification of the leak."""
+        pump = self._pump
+        self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
+        flow = self._curve.flow(pump_fraction) if self._running else 0.0
+        at_s, size = self._leak_step
+        leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
+        follow = -math.expm1(-self._step_s / self._model.lag_s)
+        for _ in range(_SUBSTEPS):
+            self._tube.append(flow)
+            self._arriving += (self._tube.popleft() - self._arriving) * follow
+            self._way_um += (self._model.gain * self._arriving - leak) * self._step_s
+        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(self._weather.size)
+        return self._read()
+
+    def _read(self) -> BenchSample:
+        of, walks = self._disturbance, self._walks
+        true_um = self._way_um + float(walks.centre @ self._weather)
+        self.true_um.append(true_um)
+        self._ticks += 1
+        laser, pressure, temperature = self._rng.standard_normal(3).tolist()
+        return BenchSample(
+            true_um + of.laser_um * laser,
+            _LEVEL_PA + float(walks.barometer @ self._weather) + of.barometer.noise * pressure
+            if of.barometer
+            else math.nan,
+            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature if of.air else math.nan,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """Result on the fitted twin."""
+
+    std_um: float  # of the true centre
+    bias_um: float  # target minus true centre
+    # After a step of the leak, weather off: furthest excursion, and time until the centre stays within `RECOVERED_UM`
+    load_peak_um: float
+    recovery_s: float
+
+
+def preview(
+    loop: LoopConfig,
+    pump: PumpConfig,
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    seed: int = 1,
+    duration_s: float = 180.0,
+    load_step_um_per_s: float = 0.6,
+) -> Preview:
+    """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
+    true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
+    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=())
+    calm = DisturbanceModel(noise, None, None)
+    stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
+    answer_um = _held(loop, pump, model, stepped, 120.0)
+    away = np.flatnonzero(np.abs(answer_um) > loop_model.RECOVERED_UM)
+    return Preview(
+        std_um=float(true_um.std()),
+        bias_um=-float(true_um.mean()),
+        load_peak_um=float(np.abs(answer_um).max()),
+        recovery_s=float((away[-1] + 1) / loop.rate_hz) if away.size else 0.0,
+    )
+
+
+def _held(
+    loop: LoopConfig, pump: PumpConfig, model: loop_model.PlantModel, bench: ModelBench, duration_s: float
+) -> records.Series:
+    """True centre after settling."""
+    rig = Rig(bench, loop, pump, model.holding_flow_um_per_s)
+    rig.hold(_SETTLE_S + duration_s)
+    return np.array(bench.true_um)[round(_SETTLE_S * loop.rate_hz) :]

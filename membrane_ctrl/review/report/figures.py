@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.review.catalogue import one_line, span
 from membrane_ctrl.review.report.json import timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
-from membrane_ctrl.review.words import one_line, span
 from membrane_ctrl.run_files.shapes import without_terms
 
 BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"

@@ -12,11 +12,11 @@ from typing import Any
 from membrane_ctrl import __version__
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
+from membrane_ctrl.review.catalogue import beside, number, part_s, span
 from membrane_ctrl.review.report import figures
 from membrane_ctrl.review.report.json import report_table, timeline, verdict
 from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
-from membrane_ctrl.review.words import beside, number, part_s, span
 from membrane_ctrl.run_files.run import Run, open_run
 
 STYLE = """

@@ -6,9 +6,9 @@ from typing import Any, Literal
 
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.review.catalogue import beside, span
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.words import beside, span
 from membrane_ctrl.run_files.run_folder import LoggedEvent, logged
 
 Word = Literal["good", "look", "bad"]

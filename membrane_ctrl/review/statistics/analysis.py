@@ -10,13 +10,13 @@ from scipy import fft
 
 from membrane_ctrl.model import errors, events, telemetry
 from membrane_ctrl.model.arrays import Column, Singles
+from membrane_ctrl.review.catalogue import span
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
 from membrane_ctrl.review.statistics.spectra import WindowStatistics, describe, window_means
-from membrane_ctrl.review.words import span
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
 

@@ -1,5 +1,6 @@
 """How a review opens: one tab per question, all on the requested time range."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -194,3 +195,12 @@ class ReviewBlueprint:
             self._plot("Time between ticks, s", "/tick/dt"),
             name="tuning",
         )
+
+
+def labels_of(names: Sequence[str]) -> list[str]:
+    """Names of overlaid runs, without the times of their starts if they differ even so; empty for a single run."""
+    if len(names) == 1:
+        return [""]
+    short = [re.sub(r"^\d{8}T\d{6}Z-(?=.)", "", name) for name in names]
+    names = short if len(set(short)) == len(names) else names
+    return [name if names.count(name) == 1 else f"{name} ({place})" for place, name in enumerate(names, 1)]

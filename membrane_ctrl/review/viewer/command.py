@@ -1,16 +1,24 @@
-"""`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time."""
+"""`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time.
 
-import re
+`review --all`: all runs of a folder in one viewer, a Rerun catalogue with a row per run, served to this machine only.
+The rows come first, from the runs' small files; each run's timeline follows in the background, newest first.
+"""
+
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import rerun as rr
+from rerun.blueprint.table import Column, SortBy, TableBlueprint, TableLayout
+from rerun_bindings import CatalogClientInternal
+
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, telemetry, terminal
-from membrane_ctrl.review import catalogue, words
+from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.viewer import blueprints, viewer
-from membrane_ctrl.review.viewer.layer import ALL, Layer
+from membrane_ctrl.review.viewer.layer import ALL, APPLICATION, Layer
 from membrane_ctrl.run_files.run import Run, open_run
 
 _THIS_MACHINE = "127.0.0.1"
@@ -79,8 +87,6 @@ def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None 
 
 
 def _show_every_run(options: ReviewOptions) -> int:
-    from membrane_ctrl.review.viewer.all_runs import RunCatalogue
-
     found = catalogue.entries(options.logs)
     if not found:
         raise errors.InputError(f"{options.logs}: contains no run")
@@ -155,7 +161,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
     runs = _with_telemetry(runs)
     span_s = _span(runs[0], options)
     zeros_s = _zeros(runs, options.align)
-    labels = labels_of([run.name for run in runs])
+    labels = blueprints.labels_of([run.name for run in runs])
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
     for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
         part_s = ALL if span_s is None else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
@@ -172,18 +178,9 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
     return viewer.CursorTime(timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2)
 
 
-def labels_of(names: Sequence[str]) -> list[str]:
-    """Names of overlaid runs, without the times of their starts if they differ even so; empty for a single run."""
-    if len(names) == 1:
-        return [""]
-    short = [re.sub(r"^\d{8}T\d{6}Z-(?=.)", "", name) for name in names]
-    names = short if len(set(short)) == len(names) else names
-    return [name if names.count(name) == 1 else f"{name} ({place})" for place, name in enumerate(names, 1)]
-
-
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     """The runs that can be shown; adds a note to the others."""
-    there = [run for run in runs if words.end_s(run)]
+    there = [run for run in runs if catalogue.end_s(run)]
     if not there:
         raise errors.InputError(f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry")
     for run in runs:
@@ -195,16 +192,16 @@ def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
-        start_s, end_s = words.part_s(run.origin_utc, options.start, options.end)
-        if start_s >= words.end_s(run):
-            raise words.not_in(run, f"--from {options.start}")
+        start_s, end_s = catalogue.part_s(run.origin_utc, options.start, options.end)
+        if start_s >= catalogue.end_s(run):
+            raise catalogue.not_in(run, f"--from {options.start}")
         if end_s <= 0:
-            raise words.not_in(run, f"--to {options.end}")
-        return (0.0 if options.start is None else start_s), (words.end_s(run) if options.end is None else end_s)
+            raise catalogue.not_in(run, f"--to {options.end}")
+        return (0.0 if options.start is None else start_s), (catalogue.end_s(run) if options.end is None else end_s)
     if options.at is not None:
-        at_s = words.moment_s(options.at, run.origin_utc)
-        if not -_AROUND_S <= at_s <= words.end_s(run) + _AROUND_S:
-            raise words.not_in(run, f"--at {options.at}")
+        at_s = catalogue.moment_s(options.at, run.origin_utc)
+        if not -_AROUND_S <= at_s <= catalogue.end_s(run) + _AROUND_S:
+            raise catalogue.not_in(run, f"--at {options.at}")
     elif options.around is not None:
         at_s = _around(run, options.around)
     else:
@@ -247,3 +244,103 @@ def _hold_s(run: Run) -> float:
             return each.mono_s
     held_s = level["time_s"][level["state"] == telemetry.State.HOLD]
     return float(held_s[0]) if held_s.size else 0.0
+
+
+_DATASET = "runs"
+# Property of a recording to its heading; the properties are an interface (docs/interfaces.md).
+PROPERTIES = {
+    "started_utc": "started, UTC",
+    "duration_s": "length, s",
+    "held_s": "held, s",
+    "std_um": "std, µm",
+    "in_band": "in band",
+    "faults": "faults",
+    "faults_share": "time in faults",
+    "kp_per_s": "Kp, 1/s",
+    "ti_s": "Ti, s",
+    "pump_scale": "pump / curve",
+    "pump_sigma": "±",
+    "geometry": "geometry",
+    "configuration": "configuration",
+    "exit": "end",
+    "marks": "marks",
+}
+
+
+class RunCatalogue:
+    """A catalogue server, until closed.
+
+    Parameters
+    ----------
+    entries : sequence of RunEntry
+        The runs, at least one.
+    folder : Path
+        Empty folder for its files, to be deleted afterwards.
+    """
+
+    def __init__(self, entries: Sequence[catalogue.RunEntry], folder: Path) -> None:
+        self._folder = folder
+        self._entries = entries
+        rows = [_row(entry, folder / f"row-{number}.rrd") for number, entry in enumerate(entries)]
+        self._server = rr.server.Server(host="127.0.0.1", datasets={_DATASET: rows})
+        # the public client would need datafusion, which takes 115 MB
+        self._dataset = rr.catalog.DatasetEntry(
+            CatalogClientInternal(self._server.url()).datasets(include_hidden=False)[0]
+        )
+        self._lay_out()
+        self.url = self._server.url()  # for clients
+        self.page = f"{self.url}/entry/{self._dataset.id}"  # its table, for the viewer
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.shutdown()
+
+    def add_timelines(self, wanted: Callable[[], bool]) -> None:
+        """Add the runs' timelines, newest first, while `wanted`; a run that has none is named on stderr."""
+        for number, entry in reversed(list(enumerate(self._entries))):
+            if not wanted():
+                return
+            try:
+                self._add_timeline(entry, self._folder / f"timeline-{number}.rrd")
+            except (errors.CommandError, OSError) as error:
+                print(f"note: {entry.name}: no timeline ({error})", file=sys.stderr)
+
+    def _add_timeline(self, entry: catalogue.RunEntry, file: Path) -> None:
+        layer = Layer(file, entry.name, overview_only=True)
+        try:
+            layer.add(open_run(entry.folder))
+        finally:
+            layer.close()
+        self._dataset.register([file.as_uri()], layer_name="timeline").wait()
+
+    def _lay_out(self) -> None:
+        """One layout for the table, one for every run."""
+        columns = [Column("recording link", name="run")]
+        learned = any(entry.pump_scale == entry.pump_scale for entry in self._entries)
+        shown = {name: words for name, words in PROPERTIES.items() if learned or not name.startswith("pump_")}
+        columns += [Column(f"property:run:{name}", name=heading) for name, heading in shown.items()]
+        hidden = [Column(f"property:RecordingInfo:{name}", visible=False) for name in ("name", "start_time")]
+        started = SortBy("property:run:started_utc", direction="Descending")
+        table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
+        coarse = blueprints.ReviewBlueprint(("",), "utc", None, Config().limits.band_um)
+        runs = coarse.made(tabs=blueprints.COARSE_TABS)
+        table.save(APPLICATION, self._folder / "table.rbl")
+        runs.save(APPLICATION, self._folder / "run.rbl")
+        self._dataset.register_blueprint((self._folder / "table.rbl").as_uri(), segment_table=True)
+        self._dataset.register_blueprint((self._folder / "run.rbl").as_uri())
+
+
+def _row(entry: catalogue.RunEntry, file: Path) -> Path:
+    """Write a recording that has only the run's properties; unknown ones are omitted."""
+    values = catalogue.as_dict(entry) | {"started_utc": f"{entry.started_utc:%Y-%m-%d %H:%M:%S}"}
+    values["geometry"] = entry.geometry[:8]
+    values["faults_share"] = entry.faults_s / entry.duration_s if entry.duration_s else float("nan")
+    # more digits would make the table's columns too wide to compare
+    values |= {name: float(f"{value:.4g}") for name, value in values.items() if isinstance(value, float)}
+    known = {name: values[name] for name in PROPERTIES if values[name] == values[name] and values[name] != ""}
+    stream = rr.RecordingStream(APPLICATION, recording_id=entry.name)
+    stream.save(file)
+    stream.send_recording_name(entry.name)
+    stream.send_property("run", rr.AnyValues(**known))
+    stream.disconnect()
+    return file

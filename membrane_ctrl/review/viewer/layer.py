@@ -17,10 +17,10 @@ from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
 from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
+from membrane_ctrl.review.catalogue import end_s
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
-from membrane_ctrl.review.words import end_s
 from membrane_ctrl.run_files import shapes, streams, summary
 from membrane_ctrl.run_files.run import Block, Run
 

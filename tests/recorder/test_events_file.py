@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import Mark, UnknownEvent
-from membrane_ctrl.run_files import events
-from membrane_ctrl.run_files.events import EventsFile, parse
+from membrane_ctrl.model.run_events import Mark, UnknownEvent, parse
+from membrane_ctrl.recorder import sink
+from membrane_ctrl.recorder.sink import EventsFile
 from membrane_ctrl.run_files.run_folder import logged
 
 
@@ -52,7 +52,7 @@ def test_a_disk_that_was_full_tears_no_line(tmp_path: Path, monkeypatch: pytest.
         room[0] -= written
         return written
 
-    monkeypatch.setattr(events.os, "write", write)
+    monkeypatch.setattr(sink.os, "write", write)
     file = EventsFile(tmp_path / "events.jsonl")
     with pytest.raises(OSError):
         file.append([{"kind": "state", "number": k} for k in range(3)])
@@ -65,7 +65,7 @@ def test_a_disk_that_was_full_tears_no_line(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_too_many_waiting_events_are_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "_WAITING_MAX", 5)
+    monkeypatch.setattr(sink, "_WAITING_MAX", 5)
     file = EventsFile(tmp_path / "missing" / "events.jsonl")
     with pytest.raises(OSError):
         file.append([{"number": k} for k in range(8)])
