@@ -11,7 +11,7 @@ from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
-from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey, records
+from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey
 from tuning.rig import HoldRig
 
 _MAP_S = 3600.0
@@ -123,7 +123,7 @@ def _checked(rig: HoldRig) -> tuple[float, float]:
     return gain, sigma
 
 
-def _returned(rig: HoldRig) -> records.Record:
+def _returned(rig: HoldRig) -> loop_model.Record:
     """Hold until the mirror is back at the setpoint, or three minutes at most."""
     for _ in range(_BACK_MOST):
         record, setpoint_um = rig.hold_about(_BACK_S)

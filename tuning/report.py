@@ -18,7 +18,8 @@ from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.files import move, users, write_text_atomic
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder
 from tuning import gains_file, session
-from tuning.identification import disturbance, identify, loop_model, records
+from tuning.identification import disturbance, identify, loop_model
+from tuning.identification.loop_model import Record, Series
 from tuning.session import Design, Verified
 
 _DPI = 100
@@ -26,7 +27,7 @@ _SEGMENT_S = 40.0
 _TIMELINE = "session_time"
 
 
-def draw_experiments(path: Path, record: records.Record, found: identify.Identified | None) -> None:
+def draw_experiments(path: Path, record: Record, found: identify.Identified | None) -> None:
     """Draw flow and readings and, once fitted, the model's response to the flow with the residuals."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     upper, middle, lower = figure.subplots(3, 1, sharex=True)
@@ -35,23 +36,18 @@ def draw_experiments(path: Path, record: records.Record, found: identify.Identif
     upper.set(ylabel="flow (um/s)")
     middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
     if found is not None:
-        middle.plot(time_s, _pump_share_um(record, found.model), linewidth=1, label="response to the pump (model)")
+        middle.plot(
+            time_s, loop_model.pump_share_um(record, found.model), linewidth=1, label="response to the pump (model)"
+        )
         lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
     middle.set(ylabel="centre (um)")
     middle.legend(loc="upper right")
     lower.set(ylabel="prediction error (um)", xlabel="time (s)")
-    _save(path, figure)
-
-
-def _pump_share_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
-    """Motion of the centre due to pump and leak alone, with the readings' mean."""
-    x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
-    way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
-    return way + float(np.mean(record.filled_displacement_um() - way))
+    write_figure(users(path), figure, _DPI)
 
 
 def draw_weather(
-    path: Path, record: records.Record, model: loop_model.PlantModel, weather: disturbance.DisturbanceModel
+    path: Path, record: Record, model: loop_model.PlantModel, weather: disturbance.DisturbanceModel
 ) -> None:
     """Draw the spectrum of a quiet hold's readings less the pump's response, and the fitted parts."""
     figure = Figure(figsize=(8, 5), layout="constrained")
@@ -59,7 +55,7 @@ def draw_weather(
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     rest = record.filled_displacement_um() - model.gain * x
     frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
-    w: records.Series = 2 * np.pi * frequency_hz[1:]
+    w: Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
     axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less pump")
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
@@ -68,7 +64,7 @@ def draw_weather(
     axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
     axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
     axes.legend(loc="best")
-    _save(path, figure)
+    write_figure(users(path), figure, _DPI)
 
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
@@ -86,8 +82,7 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
         (d, np.minimum([row.load_recovery_s for row in rows], 60.0), "recovery (s, cut at 60)", math.nan),
         (e, np.minimum(flows, 3.0), "flow std (um/s, cut at 3)", math.nan),
     ):
-        colours = ["tab:green"] + ["tab:blue"] * (len(names) - 1)
-        axes.barh(places, values, color=colours)
+        axes.barh(places, values, color=["tab:green"] + ["tab:blue"] * (len(names) - 1))
         axes.set_yticks(places, names, fontsize=7)
         axes.invert_yaxis()
         axes.set_title(title, fontsize=9)
@@ -99,11 +94,11 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
         f.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
     f.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
     f.legend(loc="best", fontsize=6)
-    _save(path, figure)
+    write_figure(users(path), figure, _DPI)
 
 
 def draw_verification(
-    path: Path, before: records.Record, after: records.Record | None, model: loop_model.PlantModel, done: Verified
+    path: Path, before: Record, after: Record | None, model: loop_model.PlantModel, done: Verified
 ) -> None:
     """Draw the readings' spectra before and after, and the ratio of standard deviations per stage."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
@@ -125,10 +120,6 @@ def draw_verification(
     right.set(xlabel="time (s)", title="kept" if done.kept else f"reverted: {done.reason}"[:90])
     right.title.set_fontsize(8)
     right.legend(loc="best")
-    _save(path, figure)
-
-
-def _save(path: Path, figure: Figure) -> None:
     write_figure(users(path), figure, _DPI)
 
 
@@ -167,14 +158,14 @@ def draw(folder: SessionFolder) -> None:
     if not folder.done("observe"):
         return
     model = session.found_of(folder).identified.model
-    quiet = records.load_record(folder.file("quiet.npz"))
+    quiet = loop_model.load_record(folder.file("quiet.npz"))
     if _outdated(folder, "weather.png", "identify", "observe"):
         draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
     if folder.done("design") and _outdated(folder, "candidates.png", "identify", "observe", "design"):
         draw_candidates(folder.file("candidates.png"), session.design_of(folder), model, quiet.dt_s)
     if folder.done("verify") and _outdated(folder, "verify.png", "identify", "observe", "verify"):
         path = folder.file("verify.npz")
-        after = records.load_record(path) if path.exists() else None
+        after = loop_model.load_record(path) if path.exists() else None
         draw_verification(folder.file("verify.png"), quiet, after, model, session.verified_of(folder))
 
 
@@ -281,9 +272,6 @@ def _image(folder: SessionFolder, name: str) -> str:
     return f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'
 
 
-# The recording's blueprint: experiment and fit, candidates, before and after.
-
-
 def write_recording(folder: SessionFolder) -> None:
     """Write `session.rrd` with the steps done so far."""
     stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
@@ -294,7 +282,7 @@ def write_recording(folder: SessionFolder) -> None:
     if folder.done("characterise"):
         _experiments(stream, folder)
     if folder.done("observe"):
-        _record(stream, "before", records.load_record(folder.file("quiet.npz")))
+        _record(stream, "before", loop_model.load_record(folder.file("quiet.npz")))
     if folder.done("design"):
         markdown = folder.candidates()
         stream.log("candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True)
@@ -303,7 +291,7 @@ def write_recording(folder: SessionFolder) -> None:
         stream.log("candidates/std_um", rr.BarChart(stds), static=True)
         stream.log("candidates/ms", rr.BarChart([row.margins.ms for row in rows]), static=True)
     if folder.file("verify.npz").exists():
-        _record(stream, "after", records.load_record(folder.file("verify.npz")))
+        _record(stream, "after", loop_model.load_record(folder.file("verify.npz")))
     stream.flush()
     stream.disconnect()
     move(part, path)
@@ -316,11 +304,11 @@ def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
         return
     found = session.found_of(folder).identified
     time_s = np.arange(len(record)) * record.dt_s
-    _series(stream, "fit/pump_share_um", time_s, _pump_share_um(record, found.model))
+    _series(stream, "fit/pump_share_um", time_s, loop_model.pump_share_um(record, found.model))
     _series(stream, "residual/prediction_error_um", time_s[1:], found.residual_um)
 
 
-def _record(stream: rr.RecordingStream, name: str, record: records.Record) -> None:
+def _record(stream: rr.RecordingStream, name: str, record: Record) -> None:
     time_s = np.arange(len(record)) * record.dt_s
     _series(stream, f"{name}/flow_um_per_s", time_s, record.flow_um_per_s)
     _series(stream, f"{name}/displacement_um", time_s, record.displacement_um)

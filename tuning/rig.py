@@ -14,7 +14,7 @@ from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import events, shape_estimate, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
-from tuning.identification.records import Record, Series
+from tuning.identification.loop_model import Record, Series
 
 
 class DrivenBench(Protocol):

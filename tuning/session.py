@@ -14,7 +14,7 @@ from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
-from tuning.identification import characterise, identify, loop_model, records
+from tuning.identification import characterise, identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import candidates, design, prediction, verify
 from tuning.rig import HoldRig
@@ -94,9 +94,9 @@ def characterise_step(
         raise kind(f"characterise: {error}") from None
     except ValueError as error:
         raise PumpUnknownError(f"characterise: {error}") from None
-    records.save_record(session.file("experiments.npz"), done.record)
+    loop_model.save_record(session.file("experiments.npz"), done.record)
     if plan is characterise.SHORT and done.held is not None:
-        records.save_record(session.file(_HELD), done.held)
+        loop_model.save_record(session.file(_HELD), done.held)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
     folder.write(session.file("experiments.json"), head)
     return done
@@ -105,7 +105,7 @@ def characterise_step(
 def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     """Results of the experiments."""
     head = session.result("characterise", "experiments.json", ExperimentsHead)
-    record = records.load_record(session.file("experiments.npz"))
+    record = loop_model.load_record(session.file("experiments.npz"))
     return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
 
@@ -137,12 +137,12 @@ def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float 
     model = found_of(session).identified.model
     session.begin("observe")
     held = session.file(_HELD)
-    record = records.load_record(held) if held.exists() else rig.hold(duration_s)
+    record = loop_model.load_record(held) if held.exists() else rig.hold(duration_s)
     try:
         disturbance = observe(record, model, rig.loop)
     except ValueError as error:
         raise errors.RejectedError(f"observe: {error}") from None
-    records.save_record(session.file("quiet.npz"), record)
+    loop_model.save_record(session.file("quiet.npz"), record)
     folder.write(session.file("disturbance.json"), disturbance)
     return disturbance
 
@@ -284,7 +284,7 @@ def verify_step(
     trial_s = verify.settle_s(after) + stages[-1][0] + _SPARE_S
     rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verify.Stage] = []
-    record: records.Record | None = None
+    record: loop_model.Record | None = None
     setpoint_um = np.empty(0)
     reason = ""
     try:
@@ -309,7 +309,7 @@ def verify_step(
         rig.keep()
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
-        records.save_record(session.file("verify.npz"), record)
+        loop_model.save_record(session.file("verify.npz"), record)
     folder.write(session.file("verified.json"), done)
     return done
 

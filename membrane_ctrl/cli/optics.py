@@ -7,6 +7,14 @@ import typer
 
 from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetArgument, TrialsOption, configured
 
+StatedOption = Annotated[
+    Path | None, typer.Option(help="Geometry to state in the set; the true one is the configuration's.")
+]
+FaultOption = Annotated[
+    list[str] | None,
+    typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
+]
+
 
 def add_commands(app: typer.Typer) -> None:
     """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
@@ -183,15 +191,10 @@ def simulate(
     drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film, um/s.")] = 0.0,
     displacement_um: Annotated[float, typer.Option(help="Initial displacement from that depth, um.")] = 0.0,
     laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser readings, um.")] = 0.0,
-    stated: Annotated[
-        Path | None, typer.Option(help="Geometry to state in the set; the true one is the configuration's.")
-    ] = None,
+    stated: StatedOption = None,
     exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel exactly (slow).")] = False,
     seed: SeedOption = 1,
-    fault: Annotated[
-        list[str] | None,
-        typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
-    ] = None,
+    fault: FaultOption = None,
     sets: Annotated[
         int, typer.Option(min=1, help="Number of sets; several make a run: 0000 full, the others fringes.")
     ] = 1,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from tuning.identification.loop_model import PlantModel
-from tuning.identification.records import Record, Series
+from tuning.identification.loop_model import PlantModel, Record, Series
 
 FINE = 40
 

@@ -28,7 +28,7 @@ from tests.support.browser import CHROMIUM, browser_tab
 from tuning import gains_file, session
 from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
 from tuning.explore.page import saver
-from tuning.identification import disturbance, loop_model, records
+from tuning.identification import disturbance, loop_model
 from tuning.identification.characterise import SHORT
 from tuning.proposal import prediction
 from tuning.rig import Rig
@@ -88,7 +88,7 @@ def test_the_sliders_begin_where_the_gains_are() -> None:
         )
 
 
-def quiet_hold(seed: int = 3) -> records.Record:
+def quiet_hold(seed: int = 3) -> loop_model.Record:
     bench = prediction.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
     rig = Rig(bench, LOOP, PumpConfig(), PLANT.holding_flow_um_per_s)
     rig.hold(30.0)
@@ -102,14 +102,14 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tmp_path_factory.mktemp("logs"), "made", "tester", "made up", Config(loop=LOOP), LOOP
     )
     record = synthetic.record(PLANT, samples=6000)
-    records.save_record(opened.file("experiments.npz"), record)
+    loop_model.save_record(opened.file("experiments.npz"), record)
     around = machine.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
     head = session.ExperimentsHead(around, ends_s, (ends_s, ends_s), machine.Finished(True, "done"))
     folder.write(opened.file("experiments.json"), head)
     session.identify_step(opened)
     quiet = quiet_hold()
-    records.save_record(opened.file("quiet.npz"), quiet)
+    loop_model.save_record(opened.file("quiet.npz"), quiet)
     found = session.found_of(opened).identified.model
     folder.write(opened.file("disturbance.json"), disturbance.observe(quiet, found, LOOP))
     session.design_step(opened)

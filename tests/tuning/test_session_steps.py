@@ -19,8 +19,7 @@ from membrane_ctrl.sessions import folder as plain
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
-from tuning.identification.loop_model import PlantModel
-from tuning.identification.records import Record, load_record, save_record
+from tuning.identification.loop_model import PlantModel, Record, load_record, save_record
 from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
 from tuning.proposal.prediction import ModelBench
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s

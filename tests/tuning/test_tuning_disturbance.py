@@ -9,8 +9,7 @@ import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.identification.disturbance import WeatherGain, fit_noise, fit_weather, lagged, observe
-from tuning.identification.loop_model import PlantModel
-from tuning.identification.records import Record
+from tuning.identification.loop_model import PlantModel, Record
 
 DT_S = 0.02
 N = 30_000

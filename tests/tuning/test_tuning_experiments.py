@@ -24,7 +24,7 @@ from membrane_ctrl.control.experiments.machine import (
 )
 from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
 from tuning.identification.characterise import ExperimentError, characterise
-from tuning.identification.records import Record
+from tuning.identification.loop_model import Record
 from tuning.rig import Rig, laser_noise_um
 
 AROUND = Around(1.24, 0.32, 5.3, 1.0)

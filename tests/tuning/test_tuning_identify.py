@@ -10,8 +10,7 @@ from synthetic import record, way_um
 
 from tuning.identification.characterise import judge, validate
 from tuning.identification.identify import identify, independence, two_gains, whiteness
-from tuning.identification.loop_model import PlantModel
-from tuning.identification.records import Record
+from tuning.identification.loop_model import PlantModel, Record
 
 TRUTH = PlantModel(0.8, 0.09, 0.15, 1.1)
 

@@ -7,8 +7,7 @@ import pytest
 from synthetic import telegraph, way_um
 
 from membrane_ctrl.control.experiments.machine import BenchSample
-from tuning.identification.loop_model import PlantModel, driven_um
-from tuning.identification.records import Record
+from tuning.identification.loop_model import PlantModel, Record, driven_um
 
 
 @pytest.mark.parametrize("dead_time_s", [0.0, 0.02, 0.0755, 0.313])

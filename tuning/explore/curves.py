@@ -12,7 +12,7 @@ from membrane_ctrl.model import arrays, errors, telemetry
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder
 from tuning import gains_file, session
-from tuning.identification import disturbance, loop_model, records
+from tuning.identification import disturbance, loop_model
 from tuning.proposal import candidates, design
 
 # An hour is a hundred times the slowest motion that the fit uses; two of its periods are the least it accepts.
@@ -65,7 +65,7 @@ def of_run(path: Path, logs: Path) -> Workpiece:
             f"{path}: no undisturbed hold of {_SHORTEST_S:.0f} s; choose another run or a session"
         )
     model, whose = _plant_for(logs, float(np.nanmedian(columns["leak_um_per_s"][part])))
-    record = records.Record(dt_s, *(columns[name][part].astype(float) for name in _COLUMNS))
+    record = loop_model.Record(dt_s, *(columns[name][part].astype(float) for name in _COLUMNS))
     try:
         weather = disturbance.observe(record, model, loop)
     except ValueError as error:

@@ -8,7 +8,7 @@ import numpy as np
 from membrane_ctrl.control.experiments import machine, trial
 from tuning.identification.disturbance import SLOWEST_S
 from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
-from tuning.identification.records import Record
+from tuning.identification.loop_model import Record
 
 MAP_THE_PUMP = "run `tune pump`"
 _FURTHER = "repeat `tune characterise` with a larger --limit-um"

@@ -24,7 +24,8 @@ from scipy.signal.windows import hann
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.filters import smoothing
-from tuning.identification import loop_model, records
+from tuning.identification import loop_model
+from tuning.identification.loop_model import Record, Series
 
 # Slower motion does not matter to the loop, and weather is no longer a random walk.
 SLOWEST_S = 100.0
@@ -41,7 +42,7 @@ _BLOCKS = 10  # of a record, whose variances show how steady the weather is
 Coloured = tuple[tuple[float, float], ...]  # (tau in s, s in unit^2 s) of s / (1 + (w tau)^2)^2
 
 
-def _coloured_psd(coloured: Coloured, w_rad_per_s: records.Series) -> records.Series:
+def _coloured_psd(coloured: Coloured, w_rad_per_s: Series) -> Series:
     parts = [intensity / (1 + (w_rad_per_s * tau_s) ** 2) ** 2 for tau_s, intensity in coloured]
     return np.sum(parts, axis=0) if parts else np.zeros_like(w_rad_per_s)
 
@@ -64,7 +65,7 @@ class Noise:
         if not all(0 < tau_s <= _LARGEST and 0 <= part <= _LARGEST for tau_s, part in self.coloured):
             raise ValueError(f"movement of {self.coloured}")
 
-    def moving_psd(self, w_rad_per_s: records.Series) -> records.Series:
+    def moving_psd(self, w_rad_per_s: Series) -> Series:
         """Two-sided spectrum of the true movement, unit^2 s."""
         walks = (self.fast + self.slow / (1 + (w_rad_per_s * self.slow_s) ** 2)) / w_rad_per_s**2
         return walks + _coloured_psd(self.coloured, w_rad_per_s)
@@ -75,13 +76,13 @@ class Noise:
         return self.white**2 * self.dt_s
 
 
-def undriven_um(record: records.Record, model: loop_model.PlantModel) -> records.Series:
+def undriven_um(record: Record, model: loop_model.PlantModel) -> Series:
     """z: the readings without the effect of pump and mean leak, (n,) um."""
     driven = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     return record.filled_displacement_um() - model.gain * driven
 
 
-def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
+def fit_noise(series: Series, dt_s: float, slow_s: float) -> Noise:
     """Fit the intensities of white noise and movement in a series; a straight trend has no effect.
 
     Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the lag of the slow
@@ -105,7 +106,7 @@ def fit_noise(series: records.Series, dt_s: float, slow_s: float) -> Noise:
     return Noise(math.sqrt(intensities[0]), fast, slow, slow_s, dt_s, coloured)
 
 
-def _prior(taus_s: records.Series, first: int) -> tuple[records.Series, records.Series]:
+def _prior(taus_s: Series, first: int) -> tuple[Series, Series]:
     """Rows R and values r: R x logs - r are independent and of unit variance; `first` logs are free."""
     one = np.eye(taus_s.size)
     rows = np.vstack((np.diff(one, 2, axis=0) / _BEND_SIGMA, np.diff(one, axis=0) / _SLOPE_SIGMA))
@@ -113,22 +114,22 @@ def _prior(taus_s: records.Series, first: int) -> tuple[records.Series, records.
 
 
 def _likeliest(
-    basis: records.Series,
-    power: records.Series,
-    count: records.Series,
-    likely: records.Series,
-    usual: records.Series,
-    start: records.Series,
-) -> records.Series:
+    basis: Series,
+    power: Series,
+    count: Series,
+    likely: Series,
+    usual: Series,
+    start: Series,
+) -> Series:
     """Logarithms of the intensities; Whittle's likelihood with its information matrix."""
 
-    def cost(logs: records.Series) -> tuple[float, records.Series]:
+    def cost(logs: Series) -> tuple[float, Series]:
         spectrum = np.exp(logs) @ basis
         off = likely @ logs - usual
         slope = _shares(logs, basis) @ (count * (1 - power / spectrum)) + likely.T @ off
         return float(count @ (np.log(spectrum) + power / spectrum) + off @ off / 2), slope
 
-    def information(logs: records.Series) -> records.Series:
+    def information(logs: Series) -> Series:
         shares = _shares(logs, basis)
         return np.asarray(shares * count @ shares.T + likely.T @ likely)
 
@@ -138,12 +139,12 @@ def _likeliest(
     return np.asarray(np.maximum(found, math.log(_FLOOR)), dtype=float)
 
 
-def _shares(logs: records.Series, basis: records.Series) -> records.Series:
+def _shares(logs: Series, basis: Series) -> Series:
     parts = np.exp(logs)[:, None] * basis
     return np.asarray(parts / parts.sum(axis=0))
 
 
-def _periodogram(increments: records.Series, dt_s: float) -> tuple[records.Series, records.Series, records.Series]:
+def _periodogram(increments: Series, dt_s: float) -> tuple[Series, Series, Series]:
     """Angular frequencies from the slowest that matters to Nyquist, tapered power per sample, independent ones."""
     taper = hann(increments.size, sym=False)
     taper /= math.sqrt(float(taper @ taper))
@@ -179,7 +180,7 @@ class WeatherGain:
     lag_s: float  # lag of the quantity's effect on the centre
     coloured: Coloured = ()  # the quantity's movement that is no walk
 
-    def psd(self, w_rad_per_s: records.Series) -> records.Series:
+    def psd(self, w_rad_per_s: Series) -> Series:
         """Two-sided spectrum of the quantity, unit^2 s."""
         return self.walk / w_rad_per_s**2 + _coloured_psd(self.coloured, w_rad_per_s)
 
@@ -199,23 +200,23 @@ class WeatherFit:
 
     barometer: WeatherGain | None
     air: WeatherGain | None
-    rest_um: records.Series
+    rest_um: Series
 
 
-def lagged(series: records.Series, lag_s: float, dt_s: float) -> records.Series:
+def lagged(series: Series, lag_s: float, dt_s: float) -> Series:
     """First-order lag that starts at its first input."""
     share = smoothing(dt_s, lag_s)
     followed = np.asarray(lfilter([share], [1.0, share - 1.0], series - series[0]), dtype=float)
     return followed + float(series[0])
 
 
-def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
+def fit_weather(record: Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
     """Regress the motion not caused by the pump on the weather.
 
     `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
     """
     z = undriven_um(record, model)
-    channels: list[tuple[records.Series, float]] = []
+    channels: list[tuple[Series, float]] = []
     if record.has_barometer:
         channels.append((record.ambient_pressure_pa, 0.0))
     if record.has_thermometer:
@@ -241,16 +242,14 @@ def fit_weather(record: records.Record, model: loop_model.PlantModel, gas_follow
     )
 
 
-def _regress(
-    z: records.Series, columns: list[records.Series], variances: records.Series, per_block: int
-) -> tuple[records.Series, records.Series]:
+def _regress(z: Series, columns: list[Series], variances: Series, per_block: int) -> tuple[Series, Series]:
     """Gains and their standard errors, with the best-fitting beta of the noise."""
     used = z.size // per_block * per_block
     blocks = np.array([column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)])
     moved = np.diff(blocks, axis=1)
     moved -= moved.mean(axis=1, keepdims=True)
 
-    def fit(beta: float) -> tuple[records.Series, records.Series, float]:
+    def fit(beta: float) -> tuple[Series, Series, float]:
         white = lfilter([1.0], [1.0, -beta], moved, axis=1)
         target, given = white[0], white[1:]
         normal = given @ given.T
@@ -286,7 +285,7 @@ class DisturbanceModel:
         """Standard deviation of a reading."""
         return self.rest.white
 
-    def psd(self, w_rad_per_s: records.Series, model: loop_model.PlantModel, loop: LoopConfig) -> records.Series:
+    def psd(self, w_rad_per_s: Series, model: loop_model.PlantModel, loop: LoopConfig) -> Series:
         """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, um^2 s.
 
         The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H), with H the pump
@@ -309,7 +308,7 @@ class DisturbanceModel:
         return np.asarray(total, dtype=float)
 
 
-def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
+def observe(record: Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
     """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
     weather = fit_weather(record, model, loop.gas_follows_air_s)
     rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
@@ -317,9 +316,7 @@ def observe(record: records.Record, model: loop_model.PlantModel, loop: LoopConf
     return replace(found, unsteady=_unsteady(record.filled_displacement_um(), found, model, loop))
 
 
-def _unsteady(
-    read_um: records.Series, found: DisturbanceModel, model: loop_model.PlantModel, loop: LoopConfig
-) -> float:
+def _unsteady(read_um: Series, found: DisturbanceModel, model: loop_model.PlantModel, loop: LoopConfig) -> float:
     """Relative standard error of the centre's standard deviation, for this record and one more like it.
 
     From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves the movement.

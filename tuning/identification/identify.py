@@ -25,7 +25,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from tuning.identification import loop_model, records
+from tuning.identification import loop_model
 
 _FILM_S = 12.0  # lag of the gas behind the air (estimate; a factor of 2 does not matter)
 _BETA_MAX = 0.9999  # 1 would mean a reading without disturbance
@@ -45,7 +45,7 @@ class NoiseModel:
     beta: float
     gamma: float
 
-    def whitened(self, moved_um: records.Series, dt_s: float) -> records.Series:
+    def whitened(self, moved_um: loop_model.Series, dt_s: float) -> loop_model.Series:
         """Prediction errors from the increments of the noise."""
         phi = math.exp(-dt_s / _FILM_S)
         zeros = [1.0, -(self.beta + self.gamma), self.beta * self.gamma]
@@ -69,7 +69,7 @@ class Identified:
 
     model: loop_model.PlantModel
     sigma: Sigma  # standard errors
-    covariance: records.Series  # (4, 4): of gain, dead time, lag, leak
+    covariance: loop_model.Series  # (4, 4): of gain, dead time, lag, leak
     noise: NoiseModel
     # Of the barometer, 0 without one; a nuisance parameter, biased low by the barometer's noise
     pressure_gain_um_per_pa: float
@@ -78,12 +78,12 @@ class Identified:
     whiteness_p: float
     independence_p: float
     largest_residual: float  # in standard deviations
-    residual_um: records.Series  # (n,): prediction errors
+    residual_um: loop_model.Series  # (n,): prediction errors
 
 
 def prediction_errors(
-    record: records.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
-) -> records.Series:
+    record: loop_model.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
+) -> loop_model.Series:
     """One-step prediction errors of a model on a record, (n - 1,) um; the first ones include the filter's start-up.
 
     `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
@@ -95,7 +95,7 @@ def prediction_errors(
     return noise.whitened(moved, record.dt_s)
 
 
-def identify(record: records.Record) -> Identified:
+def identify(record: loop_model.Record) -> Identified:
     """Fit the model; a barometer, if present, explains part of the noise.
 
     Raises ValueError if the record is too short, has no reading, or the flow never changed.
@@ -105,7 +105,7 @@ def identify(record: records.Record) -> Identified:
     if np.ptp(record.flow_um_per_s) <= 0:
         raise ValueError("the flow never changed: repeat `tune characterise`")
 
-    def errors(q: records.Series) -> records.Series:
+    def errors(q: loop_model.Series) -> loop_model.Series:
         model = loop_model.PlantModel(q[0], q[1], q[2], q[3])
         return prediction_errors(record, model, NoiseModel(q[4], q[5]), q[6] if q.size > 6 else 0.0)
 
@@ -131,7 +131,7 @@ def identify(record: records.Record) -> Identified:
     )
 
 
-def _best_fit(errors: Callable[[records.Series], records.Series], record: records.Record) -> OptimizeResult:
+def _best_fit(errors: Callable[[loop_model.Series], loop_model.Series], record: loop_model.Record) -> OptimizeResult:
     """Least squares from the most promising dead time, as the criterion has several minima."""
     extra = [-0.3] if record.has_barometer and np.ptp(record.ambient_pressure_pa) > 0 else []
     low = [-np.inf, 0.0, _LAG_MIN_S, -np.inf, 0.0, _GAMMA_MIN] + [-np.inf] * len(extra)
@@ -147,7 +147,7 @@ def _best_fit(errors: Callable[[records.Series], records.Series], record: record
     )
 
 
-def _start(record: records.Record, dead_time_s: float, extra: list[float]) -> records.Series:
+def _start(record: loop_model.Record, dead_time_s: float, extra: list[float]) -> loop_model.Series:
     """Best gain and leak for a dead time, by linear least squares on the prefiltered record."""
     unit = loop_model.PlantModel(1.0, dead_time_s, _LAG_START_S, 0.0)
     x = np.diff(loop_model.driven_um(record.flow_um_per_s, unit.dead_time_s, unit.lag_s, record.dt_s))
@@ -157,13 +157,13 @@ def _start(record: records.Record, dead_time_s: float, extra: list[float]) -> re
     return np.array([gain, dead_time_s, _LAG_START_S, leak, _BETA_START, _GAMMA_START, *extra])
 
 
-def _sigma(covariance: records.Series) -> Sigma:
+def _sigma(covariance: loop_model.Series) -> Sigma:
     total = covariance[1, 1] + covariance[2, 2] + 2 * covariance[1, 2]
     gain, dead, lag, leak, delay = np.sqrt(np.maximum([*np.diag(covariance)[:4], total], 0.0))
     return Sigma(float(gain), float(dead), float(lag), float(delay), float(leak))
 
 
-def whiteness(residual: records.Series, fitted: int = 0) -> float:
+def whiteness(residual: loop_model.Series, fitted: int = 0) -> float:
     """Ljung-Box: probability of correlations this large in white noise."""
     e = residual - residual.mean()
     n = e.size
@@ -172,7 +172,7 @@ def whiteness(residual: records.Series, fitted: int = 0) -> float:
     return float(chi2.sf(q, _LAGS - fitted))
 
 
-def independence(residual: records.Series, change: records.Series) -> float:
+def independence(residual: loop_model.Series, change: loop_model.Series) -> float:
     """Probability of residuals this correlated with earlier changes of the flow, if the model were complete."""
     e = (residual - residual.mean()) / residual.std()
     u = change - change.mean()
@@ -207,11 +207,11 @@ class TwoGains:
     difference_sigma: float  # standard error of `above - below`; infinite if the flow had two values only
 
 
-def two_gains(record: records.Record, identified: Identified) -> TwoGains:
+def two_gains(record: loop_model.Record, identified: Identified) -> TwoGains:
     """Gains below and above the mean flow of a record, which is the flow that holds."""
     model, dt_s = identified.model, record.dt_s
 
-    def whitened_way(flow_um_per_s: records.Series) -> records.Series:
+    def whitened_way(flow_um_per_s: loop_model.Series) -> loop_model.Series:
         way_um = loop_model.driven_um(flow_um_per_s, model.dead_time_s, model.lag_s, dt_s)
         return identified.noise.whitened(np.diff(way_um), dt_s)
 

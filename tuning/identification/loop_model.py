@@ -1,4 +1,6 @@
-"""The closed loop in the frequency domain, with its exact delay.
+"""The loop as tuning sees it: a record of its readings, the model of its plant, and the closed loop of both.
+
+A record has evenly sampled columns. The closed loop is in the frequency domain, with its exact delay:
 
     L = C F P,   P = k exp(-j w (theta + h / 2 + write)) / (j w (1 + j w T)),
     C = K (1 + 1 / (j w Ti) + j w Td),   F = 1 / (1 + j w Tf)
@@ -7,16 +9,133 @@ h / 2 is the mean delay of a command held for a sample. A Pade approximation wou
 designs differ; a frequency response needs none.
 """
 
+from __future__ import annotations
+
+import hashlib
+import io
 import math
-from dataclasses import dataclass
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import control
 import numpy as np
 from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.model.arrays import ComplexArray
-from tuning.identification.records import Series
+from membrane_ctrl.control.experiments.machine import BenchSample
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.arrays import ComplexArray, FloatArray
+
+Series = FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Evenly sampled readings and the flow commanded right after each of them."""
+
+    dt_s: float  # sample time
+    flow_um_per_s: Series  # (n,): commanded flow as the pump's nominal curve has it, from each reading until the next
+    displacement_um: Series  # (n,): laser readings; NaN where one was lost
+    ambient_pressure_pa: Series  # (n,): all NaN without the sensor
+    air_temperature_c: Series  # (n,)
+
+    @classmethod
+    def from_samples(cls, dt_s: float, flows_um_per_s: Sequence[float], samples: Sequence[BenchSample]) -> Record:
+        """Make a record from samples and the flows that followed them."""
+        columns = [[getattr(sample, field.name) for sample in samples] for field in fields(BenchSample)]
+        return cls(dt_s, np.array(flows_um_per_s, dtype=float), *(np.array(c, dtype=float) for c in columns))
+
+    def __len__(self) -> int:
+        return int(self.displacement_um.size)
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the record."""
+        return len(self) * self.dt_s
+
+    @property
+    def has_barometer(self) -> bool:
+        """Air pressure was read throughout."""
+        return bool(np.isfinite(self.ambient_pressure_pa).all())
+
+    @property
+    def has_thermometer(self) -> bool:
+        """Air temperature was read throughout."""
+        return bool(np.isfinite(self.air_temperature_c).all())
+
+    @property
+    def lost_fraction(self) -> float:
+        """Share of laser readings that were lost."""
+        return float(np.mean(~np.isfinite(self.displacement_um)))
+
+    def part(self, start_s: float, stop_s: float) -> Record:
+        """The samples from `start_s` up to, but excluding, `stop_s`."""
+        cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
+        return Record(self.dt_s, *(column[cut] for column in self._columns()))
+
+    def followed_by(self, *later: Record) -> Record:
+        """Join this record and its continuation. Raises ValueError for different sample times."""
+        if any(part.dt_s != self.dt_s for part in later):
+            raise ValueError("records of different sample times cannot be joined")
+        columns = zip(*(part._columns() for part in (self, *later)), strict=True)
+        return Record(self.dt_s, *(np.concatenate(parts) for parts in columns))
+
+    def filled_displacement_um(self) -> Series:
+        """Readings with lost ones interpolated. Raises ValueError if all are lost."""
+        good = np.isfinite(self.displacement_um)
+        if not good.any():
+            raise ValueError("no laser reading in the record")
+        return np.interp(np.arange(len(self)), np.flatnonzero(good), self.displacement_um[good])
+
+    def sha256(self) -> str:
+        """Hash of the data, which identifies the origin of gains."""
+        digest = hashlib.sha256(np.float64(self.dt_s).tobytes())
+        for column in self._columns():
+            digest.update(np.ascontiguousarray(column).tobytes())
+        return digest.hexdigest()
+
+    def _columns(self) -> tuple[Series, ...]:
+        return tuple(getattr(self, name) for name in _COLUMNS)
+
+
+# Raw data of a session: one compressed file per record, checked by its hash when read.
+
+_BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
+# Exceptions of NumPy and the archive, depending on the damaged byte.
+_DAMAGED = (
+    *(OSError, ValueError, TypeError, KeyError, AttributeError, MemoryError, EOFError, NotImplementedError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+_COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
+
+
+def save_record(path: Path, record: Record) -> None:
+    """Write a record atomically."""
+    file = io.BytesIO()
+    columns = {name: getattr(record, name) for name in _COLUMNS}
+    np.savez_compressed(file, dt_s=np.float64(record.dt_s), sha256=np.array(record.sha256()), **columns)
+    files.write_bytes_atomic(files.users(path), file.getvalue())
+
+
+def load_record(path: Path) -> Record:
+    """Read a record. Raises InputError if it is missing, damaged, or altered."""
+    try:
+        with files.open_plain(files.users(path)) as file, np.load(file, allow_pickle=False) as found:
+            if sum(member.file_size for member in found.zip.infolist()) > _BYTES_MAX:
+                raise ValueError("more than a record holds")
+            record = Record(float(found["dt_s"]), *(found[name] for name in _COLUMNS))
+            hashed = str(found["sha256"])
+    except FileNotFoundError:
+        raise errors.InputError(f"{path}: no such file") from None
+    except _DAMAGED as error:
+        raise errors.InputError(f"{path}: damaged ({error}); repeat the step that wrote it") from None
+    if record.sha256() != hashed:
+        raise errors.InputError(f"{path}: the data have been altered (hash differs)")
+    return record
+
 
 # The mirror as tuning sees it: an integrator behind the pump's transport delay and lag.
 #
@@ -78,6 +197,13 @@ def driven_um(flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: flo
 _SLOWEST_RAD_PER_S = 1e-4
 
 
+def pump_share_um(record: Record, model: PlantModel) -> Series:
+    """Motion of the centre due to pump and leak alone, with the mean of a record's readings, (n,)."""
+    x = driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
+    return way + float(np.mean(record.filled_displacement_um() - way))
+
+
 @dataclass(frozen=True, slots=True)
 class Gains:
     """A controller: K in 1/s, times in s; the filter precedes all three terms."""
@@ -88,11 +214,11 @@ class Gains:
     filter_s: float = 0.0
 
     @classmethod
-    def of(cls, loop: LoopConfig) -> "Gains":
+    def of(cls, loop: LoopConfig) -> Gains:
         """Gains of a configured loop."""
         return cls(loop.kp_per_s, loop.ti_s, loop.td_s, loop.measurement_filter_s)
 
-    def rounded(self) -> "Gains":
+    def rounded(self) -> Gains:
         """To four digits: more mean nothing, and people copy them."""
         return Gains(*(float(f"{value:.4g}") for value in (self.kp_per_s, self.ti_s, self.td_s, self.filter_s)))
 

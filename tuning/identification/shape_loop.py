@@ -20,7 +20,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions.live_hold import HoldError
-from tuning.identification.records import Series
+from tuning.identification.loop_model import Series
 from tuning.rig import HoldRig
 
 # White noise on a random walk, at any times: the amount of each, and the largest walk that the data permit.

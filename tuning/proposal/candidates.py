@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from membrane_ctrl.config.schema import LoopConfig
-from tuning.identification import loop_model, records
+from tuning.identification import loop_model
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.proposal.prediction import predict
 
@@ -144,11 +144,11 @@ def _search(
     low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
     high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])
 
-    def gains_at(logs: records.Series) -> loop_model.Gains:
+    def gains_at(logs: loop_model.Series) -> loop_model.Gains:
         kp_per_s, ti_s = np.exp(np.clip(logs, low, high)).tolist()
         return loop_model.Gains(kp_per_s, ti_s, 0.0, start.filter_s)
 
-    def penalised(logs: records.Series) -> float:
+    def penalised(logs: loop_model.Series) -> float:
         gains = gains_at(logs)
         outside = float(np.sum(np.maximum(0.0, low - logs) + np.maximum(0.0, logs - high)))
         peak = loop_model.sensitivity_peak(gains, model, dt_s)

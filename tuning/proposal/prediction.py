@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification import identify, loop_model, records
+from tuning.identification import identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.rig import Rig
 
@@ -308,7 +308,7 @@ def preview(
 
 def _held(
     loop: LoopConfig, pump: PumpConfig, model: loop_model.PlantModel, bench: ModelBench, duration_s: float
-) -> records.Series:
+) -> loop_model.Series:
     """True centre after settling."""
     rig = Rig(bench, loop, pump, model.holding_flow_um_per_s)
     rig.hold(_SETTLE_S + duration_s)

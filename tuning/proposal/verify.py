@@ -18,7 +18,8 @@ from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
 from tuning.gains_file import GainsFile
-from tuning.identification import disturbance, identify, loop_model, records
+from tuning.identification import disturbance, identify, loop_model
+from tuning.identification.loop_model import Record, Series
 from tuning.proposal.prediction import least_std_um, predict
 
 # Time of a stage, and growth that ends the trial there: early on only plain failures, as a minute of weather scatters
@@ -72,7 +73,7 @@ class VerificationTrial:
     accepted: bool = False  # a person chose these gains knowing that a larger deviation is predicted
 
 
-def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
+def centre_std_um(off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
     """Standard deviation of the centre without the laser's noise; 0 if the estimate is negative.
 
     `off_um` (n,) are readings less setpoint; they correct the prediction for this weather.
@@ -91,7 +92,7 @@ def centre_std_um(off_um: records.Series, trial: VerificationTrial, weather: dis
     return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
 
 
-def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
+def seen_sensitivity(off_um: Series, trial: VerificationTrial) -> float:
     """Largest sensitivity, from the excess of the spectrum over the model's prediction.
 
     Increased gain or delay of the plant shows as a peak near the crossover. The level of the weather does not
@@ -99,7 +100,7 @@ def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
     """
     gains, dt_s = loop_model.Gains.of(trial.after), trial.weather.rest.dt_s
     frequency_hz, power = welch(off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant")
-    w: records.Series = 2 * np.pi * frequency_hz
+    w: Series = 2 * np.pi * frequency_hz
     fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
     used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
     w, power = w[used], power[used]
@@ -112,7 +113,7 @@ def seen_sensitivity(off_um: records.Series, trial: VerificationTrial) -> float:
     return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
 
 
-def look(record: records.Record, setpoint_um: records.Series, trial: VerificationTrial, growth_max: float) -> Stage:
+def look(record: Record, setpoint_um: Series, trial: VerificationTrial, growth_max: float) -> Stage:
     """Judge the record so far, comparing the centre with each sample's setpoint."""
     off_um = record.filled_displacement_um() - setpoint_um
     weather = trial.weather
@@ -159,7 +160,7 @@ class Health:
     suggestions: tuple[str, ...]  # why a session is due; empty if none is
 
 
-def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig, made: GainsFile) -> Health:
+def health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFile) -> Health:
     """Judge a quiet hold against the file its gains come from. Raises ValueError if it is shorter than `LEAST_S`."""
     if record.duration_s < LEAST_S:
         raise ValueError(f"{record.duration_s:.0f} s of hold are too short to judge a loop: need {LEAST_S:.0f} s")
@@ -183,7 +184,7 @@ def health(record: records.Record, setpoint_um: records.Series, loop: LoopConfig
     return Health(std_um, least_um, std_um / least_um, designed, gain, gain_sigma, leak_um_per_s, tuple(found))
 
 
-def _natural_gain(record: records.Record, loop: LoopConfig) -> tuple[float, float]:
+def _natural_gain(record: Record, loop: LoopConfig) -> tuple[float, float]:
     """Gain and standard error without any experiment; NaN where the flow hardly moved.
 
     With feed-forward most of the flow responds to the air's temperature, and their effects on the centre cancel: k
