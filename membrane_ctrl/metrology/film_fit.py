@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.polynomial import legendre
-from numpy.polynomial import polynomial as series
+from numpy.polynomial import legendre, polynomial
 
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.film_law import Bowl, FilmLaw, HarmonicCause
@@ -36,8 +35,7 @@ _NEGLECTED = 0.005
 # by which the law's misfit is unlike that of the terms without a law: natural logarithm, of a Cauchy distribution
 _UNLIKE = 1.0
 _SURE = 4.0  # sigmas
-_NODES = 40
-_ITERATIONS = 40
+_NODES = _ITERATIONS = 40
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
     slopes = [np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(np.eye(4)[k])) for k in (1, 2, 3)]
-    excess = 2 * rho * series.polyval(rho**2, series.polyder(film_law.excess())) / film_law.excess_rms()
+    excess = 2 * rho * polynomial.polyval(rho**2, polynomial.polyder(film_law.excess())) / film_law.excess_rms()
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
 
 
@@ -329,6 +327,8 @@ def _fit_ring(
 
 def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) -> FloatArray:
     """Zernike terms (n, 3) of one unit of a ring's wave, as a fit of slopes inside `reach` finds them."""
+    from scipy.special import eval_jacobi
+
     rho, weight = _radii(reach)
 
     def slopes(part: legendre.Legendre) -> FloatArray:
@@ -339,24 +339,11 @@ def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) 
     terms = []
     for n in range(order, 8, 2):
         # R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v - 1), here by Legendre's least squares (exact)
-        radial = legendre.Legendre.fit(rho**2, _jacobi((n - order) // 2, order, 2 * rho**2 - 1), 4, domain=[0, 1])
+        jacobi = eval_jacobi((n - order) // 2, 0, order, 2 * rho**2 - 1)
+        radial = legendre.Legendre.fit(rho**2, jacobi, 4, domain=[0, 1])
         terms.append(np.sqrt(2 * (n + 1)) * slopes(radial))
     onto = np.linalg.pinv(np.stack(terms).T)
-    out = []
-    for s, q in zip(bowls.slackness.ravel(), bowls.load.ravel(), strict=True):
-        bowl = Bowl(np.asarray(s), np.asarray(q), bowls.poisson, bowls.radius_mm)
-        out.append(onto @ slopes(bowl.harmonic(order, cause)))
-    found = np.array(out)
+    loads = zip(bowls.slackness.ravel(), bowls.load.ravel(), strict=True)
+    each = (Bowl(np.asarray(s), np.asarray(q), bowls.poisson, bowls.radius_mm) for s, q in loads)
+    found = np.array([onto @ slopes(bowl.harmonic(order, cause)) for bowl in each])
     return found[:, 1:] if order == 1 else found  # without tilt
-
-
-def _jacobi(k: int, m: int, x: FloatArray) -> FloatArray:
-    """P_k^(0, m), k up to 3, by its recurrence."""
-    before, now = np.zeros_like(x), np.ones_like(x)
-    for n in range(1, k + 1):
-        c = 2 * n + m
-        first = 2 * n * (n + m) * (c - 2)
-        linear = (c - 1) * (c * (c - 2) * x - m * m)
-        older = 2 * (n - 1) * (n + m - 1) * c
-        before, now = now, (linear * now - older * before) / first if first else (x * (m + 2) - m) / 2
-    return now
