@@ -16,9 +16,10 @@ import aiomqtt
 
 from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.doors.names import TABLE, Door, Published
-from membrane_ctrl.model import clock, errors, files
+from membrane_ctrl.model import errors, files
 
 _LEAVES_S = 2.0
+_AGAIN_S = 1.0  # a returned broker has values within two seconds, however long it was away
 _KEEPALIVE_S = 10  # the broker notices a cut line after one and a half of these
 _STATE_LETTERS = 255  # the longest state that Home Assistant takes
 _CLASSES = {"Pa": "pressure", "°C": "temperature"}  # of Home Assistant; it knows no micrometres
@@ -30,7 +31,7 @@ async def serve(config: MqttConfig, door: Door) -> None:
     password = _read(config.password_file)
     context = _context(config)
     will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
-    failures, where = 0, f"{config.host}:{config.port}"
+    told, where = False, f"{config.host}:{config.port}"
     while True:
         try:
             async with aiomqtt.Client(
@@ -42,15 +43,15 @@ async def serve(config: MqttConfig, door: Door) -> None:
                 tls_context=context,
                 keepalive=_KEEPALIVE_S,
             ) as client:
-                failures = 0
+                told = False
                 print(f"mqtt: connected to {where}", file=sys.stderr, flush=True)
                 await _converse(client, config, door, base)
         except* (aiomqtt.MqttError, OSError) as group:
-            if not failures:
+            if not told:
                 reason = "; ".join(str(error) for error in group.exceptions)
                 print(f"mqtt: {where}: {reason}; trying again", file=sys.stderr, flush=True)
-            failures += 1
-        await asyncio.sleep(clock.pause_s(failures))
+            told = True
+        await asyncio.sleep(_AGAIN_S)
 
 
 def _read(file: str | None) -> str | None:
