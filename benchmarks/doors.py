@@ -3,15 +3,16 @@
 python -m benchmarks.doors FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
 
 Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with aiomqtt, asyncua,
-caproto for Channel Access, p4p for PV Access) reads all names twice a second. Broker and clients are killed and started
-again four times each, then the door three times. A bare loop of the hold's rate, in a process of its own, tells what
-the machine does to any such loop. FOLDER gets the raw lines; `--tell` prints the figures from them again.
+caproto for Channel Access, p4p for PV Access) reads all names twice a second. Broker and clients are killed and
+started again four times each, then the door three times. A bare loop of the hold's rate, in a process of its own, tells
+what the machine does to any such loop. FOLDER gets the raw lines; `--tell` prints the figures from them again.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
 import os
 import shutil
@@ -55,7 +56,9 @@ def lines(path: Path) -> list[Line]:
     """The complete lines of a file of JSON lines; none if it is not there."""
     if not path.exists():
         return []
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"]
+    return [
+        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"
+    ]
 
 
 class Told:
@@ -227,7 +230,9 @@ class Bench:
         out = self._folder / f"{who}.log"
         with out.open("ab") as log:
             begin = log.tell()
-            process = subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True)
+            process = subprocess.Popen(
+                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True
+            )
         self._running[who] = process
         if self._raised and who in ("hold", "bare"):
             Path(f"/proc/{process.pid}/autogroup").write_text(RAISED, encoding="utf-8")
@@ -306,7 +311,7 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
 
 def _phases(told: list[Line]) -> list[tuple[str, float, float]]:
     marks = [(line["phase"], line["utc_s"]) for line in told if "phase" in line]
-    return [(name, begin, end) for (name, begin), (_, end) in zip(marks, marks[1:], strict=False)]
+    return [(name, begin, end) for (name, begin), (_, end) in itertools.pairwise(marks)]
 
 
 def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
@@ -403,7 +408,9 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--apart-minutes", type=float, default=10.0)
-    parser.add_argument("--raised", action="store_true", help="raise hold and bare loop above the machine's other work")
+    parser.add_argument(
+        "--raised", action="store_true", help="raise hold and bare loop above the machine's other work"
+    )
     parser.add_argument("--tell", action="store_true", help="only the figures of a folder that was measured")
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--ports", type=json.loads, help=argparse.SUPPRESS)

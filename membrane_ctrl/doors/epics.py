@@ -17,8 +17,9 @@ from membrane_ctrl.doors.names import TABLE, Door, Value
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Action
 
-# Clients may write commands only; EPICS by itself lets them write everything
-_RULES = "ASG(DEFAULT) { RULE(1, READ) }\nASG(COMMAND) { RULE(1, READ) RULE(1, WRITE) }\n"
+# Clients may write the value of a command (level 0) only. EPICS by itself lets them write everything, and the other
+# fields (FLNK, SCAN, ASG) would send commands in chains, again and again, or shut them.
+_RULES = "ASG(DEFAULT) { RULE(1, READ) }\nASG(COMMAND) { RULE(1, READ) RULE(0, WRITE) }\n"
 _TEXT_BYTES = 512
 _DIGITS = 4
 

@@ -20,6 +20,7 @@ from membrane_ctrl.model import errors, files
 
 _LEAVES_S = 2.0
 _AGAIN_S = 1.0  # a returned broker has values within two seconds, however long it was away
+_QUEUED_MOST = 32  # commands that wait; aiomqtt drops what a flood brings beyond
 _KEEPALIVE_S = 10  # the broker notices a cut line after one and a half of these
 _STATE_LETTERS = 255  # the longest state that Home Assistant takes
 _CLASSES = {"Pa": "pressure", "°C": "temperature"}  # of Home Assistant; it knows no micrometres
@@ -42,6 +43,7 @@ async def serve(config: MqttConfig, door: Door) -> None:
                 will=will,
                 tls_context=context,
                 keepalive=_KEEPALIVE_S,
+                max_queued_incoming_messages=_QUEUED_MOST,
             ) as client:
                 told = False
                 print(f"mqtt: connected to {where}", file=sys.stderr, flush=True)

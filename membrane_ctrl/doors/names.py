@@ -9,10 +9,13 @@ from typing import Any
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
 
 Value = float | str | None  # None: not known
+
+_WAITING_MOST = 8
 
 COMMANDS = {str(action.do): action for action in (*ACTIONS, STOP)}
 
@@ -99,6 +102,7 @@ class Door:
             "manual": (0.0, flow_max),
         }
         self._answer = ""
+        self._turn, self._waiting = asyncio.Lock(), 0
 
     @classmethod
     def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Door":
@@ -133,7 +137,21 @@ class Door:
         if not may(WebUser(by, self.settings.role), self.feed.seen.role, action):
             return f"{name} refused: needs the role {action.role}"
         try:
-            asked = request(action, f"door: {by}", str(given))
+            text = str(given)
+            if len(text) > TEXT_BYTES:  # the port would drop a client that sends too much
+                raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
+            asked = request(action, f"door: {by}", text)
         except ValueError as error:
             return str(error)
-        return await asyncio.to_thread(self.feed.ask, asked)
+        return await self._in_turn(asked)
+
+    async def _in_turn(self, asked: dict[str, Any]) -> str:
+        """One request after the other: the port would drop clients of one name that crowd it, the feed among them."""
+        if self._waiting >= _WAITING_MOST and asked["do"] != STOP.do:
+            return f"{asked['do']} refused: too many commands at once"
+        self._waiting += 1
+        try:
+            async with self._turn:
+                return await asyncio.to_thread(self.feed.ask, asked)
+        finally:
+            self._waiting -= 1

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from benchmarks.doors import lines
+from membrane_ctrl.doors.names import TABLE
 from tests.control_port.port_run import PortRun, port_run
 from tests.web.test_page import free_port, ticking
 
@@ -189,6 +192,47 @@ with Context("pva") as client:
     found["answer"] = client.get("mirror:answer").partition(", ")[2]
 print(json.dumps(found))
 """
+HOSTILE_OPCUA = """
+import asyncio, json
+from asyncua import Client, ua
+async def name_of(awaited):
+    try:
+        said = await awaited
+    except ua.UaError as error:
+        return type(error).__name__
+    return said if isinstance(said, str) else "done"
+async def main():
+    found = dict()
+    async with Client("opc.tcp://127.0.0.1:{opcua}/membrane_ctrl") as client:
+        space = await client.get_namespace_index("urn:membrane-ctrl:mirror")
+        node = lambda name: client.get_node(f"ns={{space}};s=mirror{{name}}")
+        given = dict(nan=[float("nan")], text=["abc"], none=[], two=[1.0, 2.0], array=[[1.0]], bytes=[b"1"])
+        for name, values in dict(given, huge=["1" * 1000000]).items():
+            said = await name_of(node("").call_method(f"{{space}}:setpoint", *values))
+            found[name] = said.rpartition("opcua: ")[2]
+        found["add"] = await name_of(client.nodes.objects.add_object(space, "x"))
+        found["delete"] = await name_of(client.delete_nodes([node(".error_um")]))
+        off = ua.DataValue(ua.Variant(False))
+        found["shut"] = await name_of(node(".do.stop").write_attribute(ua.AttributeIds.Executable, off))
+        found["unit"] = await name_of(node(".error_um.unit").write_value("mm"))
+    print(json.dumps(found))
+asyncio.run(main())
+"""
+# a field that is not the value would chain commands, repeat them, or shut them
+HOSTILE_CA = """
+import json
+from caproto.sync.client import read, write
+found = dict()
+for name, value in (
+    ("setpoint.FLNK", "mirror:do:stop"), ("setpoint.OUT", "mirror:error_um"), ("setpoint.SCAN", [6]),
+    ("setpoint.PROC", [1]), ("stop.ASG", "DEFAULT"), ("stop.DISP", [1]), ("setpoint", float("nan")),
+    ("setpoint", 1e9), ("mark", "x" * 5000), ("mark", bytes([27, 91, 255])),
+):
+    status = write("mirror:do:" + name, value, notify=True, timeout=20, repeater=False).status.name
+    answer = bytes(read("mirror:answer", repeater=False).data).decode().rstrip(chr(0)).partition("epics: ")[2]
+    found[name + " " + str(value)[:3]] = answer if status == "ECA_NORMAL" else status
+print(json.dumps(found))
+"""
 WATCHER = """
 import asyncio, json
 from asyncua import Client
@@ -230,6 +274,13 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
             assert (values["error_um"], values["run"]) == (0.25, "the-run")
             await told(port, f"{base}/do/setpoint", "1.5")
             assert (await answer()).endswith("mqtt: setpoint: done")
+            for command, text, says in (
+                ("setpoint", "nan", "mqtt: Setpoint: enter a finite number in um"),
+                ("open_the_roof", "", "mqtt: no such command"),
+                ("mark", "x" * 100_000, "mqtt: mark refused: longer than 500 bytes"),
+            ):
+                await told(port, f"{base}/do/{command}", text)
+                assert (await answer()).endswith(says)
         assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1.5)]
         found = json.loads(await heard(port, "homeassistant/device/membrane_bench/config"))
         assert found["availability_topic"] == f"{base}/availability"
@@ -272,3 +323,57 @@ async def test_opc_ua_and_epics_survive_the_hold(tmp_path: Path) -> None:
             async with held(tmp_path):
                 assert await said_by(WATCHER, ports, good) == good
             assert await said_by(WATCHER, ports, bad) == bad
+
+
+@pytest.mark.campaign
+async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
+    ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
+    async with held(tmp_path) as run, doors(tmp_path, SERVERS.format(**ports)):
+        number, finite = "Setpoint: enter a number in um", "Setpoint: enter a finite number in um"
+        assert await said_by(HOSTILE_OPCUA, ports) == {
+            "nan": finite, "text": number, "none": number, "two": "BadInvalidArgument", "array": "BadInvalidArgument",
+            "bytes": "BadInvalidArgument", "huge": "setpoint refused: longer than 500 bytes",
+            **dict.fromkeys(("add", "delete", "shut", "unit"), "BadUserAccessDenied"),
+        }  # fmt: skip
+        fields = ("FLNK mir", "OUT mir", "SCAN [6]", "PROC [1]")
+        assert await said_by(HOSTILE_CA, ports) == {
+            **{f"setpoint.{each}": "ECA_NOWTACCESS" for each in fields},
+            "stop.ASG DEF": "ECA_NOWTACCESS", "stop.DISP [1]": "ECA_NOWTACCESS", "setpoint nan": finite,
+            "setpoint 100": "setpoint refused: setpoint 1e+09 um is outside the limits (-2000 .. 500 um)",
+            "mark xxx": "mark refused: longer than 500 bytes",
+            "mark b'\\": "mark refused: text: only printable characters, in one line",
+        }  # fmt: skip
+        assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1e9)], "which the tick refused"
+
+
+async def fresh(file: Path, after_s: float) -> None:
+    """Wait until the client has all names, made after a moment (UTC seconds)."""
+
+    def there() -> bool:
+        sweeps = (line for line in lines(file) if line.get("names") == len(TABLE))
+        return any(line["utc_s"] - line["oldest_s"] > after_s for line in sweeps)
+
+    async with asyncio.timeout(3 * PATIENCE_S):  # the client has to import its libraries, too
+        while True:
+            if there():
+                return
+            await asyncio.sleep(0.1)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["opcua", "ca", "pva"])
+async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) -> None:
+    ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
+    part = (sys.executable, "-m", "benchmarks.doors", str(tmp_path), "--part", kind, "--ports", json.dumps(ports))
+    seen, settings = tmp_path / f"{kind}.jsonl", SERVERS.format(**ports)
+    async with held(tmp_path), AsyncExitStack() as stack:
+        async with doors(tmp_path, settings) as door:
+            async with program(*part):  # killed at the end
+                await fresh(seen, time.time())
+            client = await stack.enter_async_context(program(*part))
+            await fresh(seen, time.time())
+            door.kill()
+            await door.wait()
+        async with doors(tmp_path, settings):
+            await fresh(seen, time.time())
+            assert client.returncode is None, "the same client"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import json
 import math
@@ -128,6 +129,9 @@ async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
         ("setpoint", "1e9", "outside the limits"),
         ("mark", "a\nb", "printable"),
         ("mark", "x" * 501, "longer than 500 bytes"),
+        ("mark", "ü" * 251, "longer than 500 bytes"),
+        ("mark", "x" * 9000, "mark refused: longer than 500 bytes"),
+        ("setpoint", "1" * 9000, "longer than 500 bytes"),
         ("gains", "", "no such command"),
         ("__class__", "", "no such command"),
     ],
@@ -137,6 +141,26 @@ async def test_nonsense_gets_an_answer(tmp_path: Path, command: str, given: str,
         door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
         assert says in await door.ask("opcua", command, given)
         assert run.asked == [] or given == "1e9", "the tick judges limits"
+
+
+async def test_a_crowd_of_commands_waits_its_turn_and_stop_gets_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    door = door_with("operate", dataclasses.replace(seen_hold(), role="operate"))
+    inside, most, sent = 0, 0, []
+
+    def ask(request: dict[str, object]) -> str:
+        nonlocal inside, most
+        inside, most = inside + 1, max(most, inside + 1)
+        sent.append(request["do"])
+        time.sleep(0.001)  # the others would come in now
+        inside -= 1
+        return "done"
+
+    monkeypatch.setattr(door.feed, "ask", ask)
+    said = await asyncio.gather(*(door.ask("opcua", "mark", "x") for _ in range(50)), door.ask("epics", "stop"))
+    assert most == 1
+    assert sent == ["mark"] * 8 + ["stop"]
+    assert sum("too many commands at once" in each for each in said) == 42
+    assert (await door.ask("opcua", "mark", "x")).endswith("done")
 
 
 def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None:
