@@ -4,8 +4,8 @@ python -m benchmarks.doors FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
 
 Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with aiomqtt, asyncua,
 caproto for Channel Access, p4p for PV Access) reads all names twice a second. Broker and clients are killed and
-started again four times each, then the door three times. A bare loop of the hold's rate, in a process of its own, tells
-what the machine does to any such loop. FOLDER gets the raw lines; `--tell` prints the figures from them again.
+started again four times each, then the door three times. A bare loop of the hold's rate, in a process of its own,
+tells what the machine does to any such loop. FOLDER gets the raw lines; `--tell` prints the figures from them again.
 """
 
 from __future__ import annotations
