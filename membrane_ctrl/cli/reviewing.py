@@ -79,9 +79,22 @@ def review(
 
 
 def report(
-    run: RunArgument,
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folder, its name or part of the name, or `last`.")
+    ],
     out: Annotated[
-        Path | None, typer.Option(help="Output folder for report.html and report.json; RUN/report by default.")
+        Path | None,
+        typer.Option(help="Output folder for report.html and report.json; RUN/report, or `fleet`, by default."),
+    ] = None,
+    fleet: Annotated[
+        bool, typer.Option("--fleet", help="Several runs, or folders of runs: one page with a line for each.")
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="With --fleet: worker processes; one per core by default.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="With --fleet: run on this Dask scheduler, e.g. tcp://host:8786."),
     ] = None,
     compare: Annotated[
         Path | None,
@@ -93,10 +106,20 @@ def report(
     end: ToOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Write the stability report of a run: one HTML page and its figures as JSON."""
+    """Write the stability report of a run, or of many: one HTML page and its figures as JSON."""
+    if fleet:
+        if compare is not None:
+            raise errors.InputError("--compare: compares two runs; leave out --fleet")
+        from membrane_ctrl.review.report.fleet import FleetOptions, fleet_command
+
+        return fleet_command(FleetOptions(runs, out or Path("fleet"), start, end, workers, scheduler, json))
+    if len(runs) > 1:
+        raise errors.InputError(f"{runs[1]}: one run at a time; --fleet makes one page of several")
+    if workers is not None or scheduler is not None:
+        raise errors.InputError("--workers and --scheduler are for --fleet")
     from membrane_ctrl.review.report.html import report_command
 
-    return report_command(run, out, compare, start, end, json)
+    return report_command(runs[0], out, compare, start, end, json)
 
 
 def export_run(

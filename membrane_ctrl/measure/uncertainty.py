@@ -1,14 +1,10 @@
 """The `uncertainty` command: Monte Carlo over geometry and pixel noise, of a set or of the change between two."""
 
-import importlib
 import json
-import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,13 +20,13 @@ from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_grad
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.processes.child import results_of
 
 # Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to twelve digits.
 
 _BATCH = 100  # trials per job: a tenth of a second, so that the bar moves and no worker waits for long
 # A process takes about two seconds to start (imports, compiled loops): less work than this stays in this process.
 _WORTH_PROCESSES = 5000
-_CONNECT_S = 30
 
 
 def run_everywhere(
@@ -53,37 +49,10 @@ def run_everywhere(
     if workers is None:
         workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
     try:
-        with _results(job, batches, min(workers, len(batches)), scheduler) as results:
+        with results_of(job, batches, min(workers, len(batches)), scheduler) as results:
             return np.concatenate(list(terminal.counted(results, "trials", len(batches))))
     except ArithmeticError as error:
         raise errors.InputError(f"uncertainty: {error}") from None
-
-
-@contextmanager
-def _results(job: Any, batches: list[range], workers: int, scheduler: str | None) -> Iterator[Iterator[FloatArray]]:
-    """Results of the batches, in order."""
-    if scheduler is not None:
-        with _dask_client(scheduler) as client:
-            yield (future.result() for future in client.map(job, batches, pure=False))
-    elif workers > 1:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            yield pool.map(job, batches)
-    else:
-        yield map(job, batches)
-
-
-def _dask_client(address: str) -> Any:
-    try:
-        distributed = importlib.import_module("distributed")
-    except ImportError:
-        text = "--scheduler: Dask is not installed; install the extra `dask` (pip install 'membrane-ctrl[dask]')"
-        raise errors.InputError(text) from None
-    try:
-        return distributed.Client(address, timeout=_CONNECT_S)
-    except ValueError as error:
-        raise errors.InputError(f"--scheduler {address}: {error}") from None
-    except OSError as error:  # includes time-outs
-        raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None
 
 
 @dataclass(frozen=True)

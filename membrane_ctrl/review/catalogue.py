@@ -10,7 +10,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from membrane_ctrl.model import errors, events, files, run_events
+from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.clock import parse_duration_s
 from membrane_ctrl.run_files import column_reader, disk_budget, run_folder, tables
 from membrane_ctrl.run_files.run import Run, origin_of
@@ -18,6 +21,7 @@ from membrane_ctrl.run_files.run import Run, origin_of
 # A file of this name in a run's folder keeps it from being pruned.
 KEPT_FILE = ".keep"
 _LEVEL_S = 1.0
+_POINTS = 80  # of a run's small line
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +83,7 @@ class Filter:
 def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     _require_folder(logs_dir)
-    found = [_entry_or_why(folder) for folder in _folders(logs_dir)]
+    found = [_entry_or_why(folder) for folder in folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
 
 
@@ -136,24 +140,23 @@ def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     run, logs_dir = Path(run), Path(logs_dir)
     if run.exists() or not logs_dir.is_dir():
         return run
-    folders = _folders(logs_dir)
-    if str(run) == "last" and folders:
-        return folders[-1]
-    near = [folder for folder in folders if folder.name == str(run)]
-    near = near or [folder for folder in folders if str(run) in folder.name]
+    known = folders(logs_dir)
+    if str(run) == "last" and known:
+        return known[-1]
+    near = [folder for folder in known if folder.name == str(run)]
+    near = near or [folder for folder in known if str(run) in folder.name]
     if len(near) > 1:
         raise errors.InputError(f"{run}: several runs match: {', '.join(folder.name for folder in near[:4])}")
     return near[0] if near else run
 
 
-def _folders(logs_dir: Path) -> list[Path]:
+def folders(logs_dir: Path) -> list[Path]:
     """The folders of runs, by name; hidden ones are remains of deleted runs."""
-    return [
-        folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and _may_be_run(folder)
-    ]
+    return [folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and may_be_run(folder)]
 
 
-def _may_be_run(folder: Path) -> bool:
+def may_be_run(folder: Path) -> bool:
+    """Whether a folder is a run, as far as can be told."""
     try:
         return run_folder.is_run(folder)
     except OSError:  # unreadable: unknown whether it is a run
@@ -297,3 +300,25 @@ def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) ->
     parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
     told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
     return [f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)" for name, time_s in told]
+
+
+def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
+    """A small SVG line; gaps where values are missing."""
+    y = np.asarray(values, dtype=np.float64)
+    if y.size > _POINTS:
+        y = np.array([part.mean() for part in np.array_split(y, _POINTS)])
+    known = np.isfinite(y)
+    if known.sum() < 2:
+        return ""
+    low, high = y[known].min(), y[known].max()
+    rows = height - 3 - (y - low) / max(high - low, 1e-12) * (height - 6)
+    columns = np.arange(y.size) * width / max(y.size - 1, 1)
+    path = " ".join(
+        f"{'L' if place and known[place - 1] else 'M'}{column:.1f},{row:.1f}"
+        for place, (column, row) in enumerate(zip(columns, rows, strict=True))
+        if known[place]
+    )
+    return (
+        f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" role="img">'
+        f'<path d="{path}" fill="none" stroke="currentColor" stroke-width="1.2"/></svg>'
+    )

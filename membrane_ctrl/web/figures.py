@@ -1,10 +1,10 @@
-"""What the page draws, once for all viewers: the history chart, the map of the figure, a run's sparkline."""
+"""What the page draws, once for all viewers: the history chart, the map of the figure."""
 
 import asyncio
 import io
 import math
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Generic, TypeVar
@@ -128,23 +128,3 @@ class Shared(Generic[T]):
         if key not in self._made:
             self._made[key] = asyncio.create_task(asyncio.to_thread(self._make, *key)), now_s + self._life_s
         return await asyncio.shield(self._made[key][0])  # a viewer who leaves takes it from nobody
-
-
-def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
-    """A small SVG line; gaps where values are missing."""
-    y = np.asarray(values, dtype=np.float64)
-    known = np.isfinite(y)
-    if known.sum() < 2:
-        return ""
-    low, high = y[known].min(), y[known].max()
-    rows = height - 3 - (y - low) / max(high - low, 1e-12) * (height - 6)
-    columns = np.arange(y.size) * width / max(y.size - 1, 1)
-    path = " ".join(
-        f"{'L' if place and known[place - 1] else 'M'}{column:.1f},{row:.1f}"
-        for place, (column, row) in enumerate(zip(columns, rows, strict=True))
-        if known[place]
-    )
-    return (
-        f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" role="img">'
-        f'<path d="{path}" fill="none" stroke="currentColor" stroke-width="1.2"/></svg>'
-    )

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 from nicegui import ui
 
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
+from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import LiveReader, Progressed
@@ -25,7 +25,6 @@ from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import WebUser, outranks
 from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history
 
-_POINTS = 80
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
 _LOOK_S = 1.0
@@ -94,10 +93,7 @@ def _picture(folder: Path, ended: float | bool) -> str:
         level = open_run(folder).level(60.0, names=("mean_error_um",))
     except (OSError, ValueError):
         return ""
-    values = level["mean_error_um"]
-    if values.size > _POINTS:
-        values = np.array([part.mean() for part in np.array_split(values, _POINTS)])
-    return figures.sparkline(values)
+    return sparkline(level["mean_error_um"])
 
 
 def run_folder(logs: Path, name: str) -> Path | None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, thinned
 
@@ -75,9 +76,9 @@ def test_values_that_are_missing_stay_missing() -> None:
 
 
 def test_sparklines_and_charts_are_drawn_of_anything() -> None:
-    assert figures.sparkline([1.0]) == ""
-    assert figures.sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
-    assert 'd="M' in figures.sparkline([5.0, 5.0])
+    assert sparkline([1.0]) == ""
+    assert sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
+    assert 'd="M' in sparkline([5.0, 5.0])
     series = Series(np.array([1.0, 2.0]), np.array([0.0, math.nan]), np.array([1.0, math.nan]), np.array([2.0, 1.0]))
     options = figures.chart("error_um", series, True, 60.0)
     assert options["series"][2]["data"] == [[1000.0, 1.0], [2000.0, None]]

@@ -83,10 +83,15 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
         parts.append(f"<figure>{figures.overview(other)}</figure>")
     parts.append(_section("Timeline", _timeline(analysis)))
     parts.append(f"<footer>membrane-ctrl {__version__}, report of {_text(str(run.folder.name))}</footer>")
+    return html_page(run.name, "".join(parts))
+
+
+def html_page(title: str, body: str) -> str:
+    """A page in the report's style; the body is HTML, the title a text."""
     return (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>{_text(run.name)}</title><style>{STYLE}</style></head><body><main>{''.join(parts)}</main></body></html>"
+        f"<title>{_text(title)}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>"
     )
 
 
@@ -111,7 +116,7 @@ def _found(analysis: Analysis) -> str:
         ]
         for event in analysis.found[:_LINES_MOST]
     ]
-    return _table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(len(analysis.found))
+    return html_table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(len(analysis.found))
 
 
 def _windows(analysis: Analysis) -> str:
@@ -127,7 +132,7 @@ def _windows(analysis: Analysis) -> str:
         for window in (() if series is None else series.windows)
     ]
     band = f"in ±{analysis.run.config.limits.band_um:g} µm"
-    return _table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band], rows)
+    return html_table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band], rows)
 
 
 def _details(analysis: Analysis) -> str:
@@ -203,7 +208,7 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare
     _, sentence = verdict(other)
     if analysis.is_part and not other.is_part:
         sentence = f"Part of this run against the whole other run. {sentence}"
-    table = _table(["", "this run", "other run", "", "difference", "p", ""], rows)
+    table = html_table(["", "this run", "other run", "", "difference", "p", ""], rows)
     return f"<p>{_text(sentence)}</p>{table}"
 
 
@@ -213,7 +218,7 @@ def _timeline(analysis: Analysis) -> str:
         [f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}", _text(each.event.kind), _text(_said(each.line))]
         for each in told[:_LINES_MOST]
     ]
-    return _table(["UTC", "what", ""], rows) + _more(len(told))
+    return html_table(["UTC", "what", ""], rows) + _more(len(told))
 
 
 def _said(event: dict[str, Any]) -> str:
@@ -241,7 +246,8 @@ def _facts(facts: Iterable[tuple[str, str]]) -> str:
     return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; its cells are HTML."""
     cells = "".join(f"<th>{title}</th>" for title in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<div class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
@@ -278,14 +284,19 @@ def report_command(
     text = plain_json.dumps(table, indent=1)
     page = render(analysis, other, differences)
     with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
-        files.make_folder(folder)
-        files.write_text_atomic(folder / "report.json", text + "\n")
-        files.write_text_atomic(folder / "report.html", page)
+        write_report(folder, text, page)
     if json:
         print(text)
     else:
         _say(analysis, other, folder, time.monotonic() - began_s)
     return 0
+
+
+def write_report(folder: Path, text: str, page: str) -> None:
+    """Write a report's JSON and its page into a folder, which is made. Raises OSError."""
+    files.make_folder(folder)
+    files.write_text_atomic(folder / "report.json", text + "\n")
+    files.write_text_atomic(folder / "report.html", page)
 
 
 def _other(run: Run, start: str | None, end: str | None) -> Analysis:

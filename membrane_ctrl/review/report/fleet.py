@@ -1,0 +1,170 @@
+"""The report of many runs, `report --fleet`: a page with a line for each, and each run's own report beside it."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from membrane_ctrl.model import errors, events, files, plain_json, run_events, terminal
+from membrane_ctrl.processes.child import results_of
+from membrane_ctrl.review import catalogue
+from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
+from membrane_ctrl.review.report.html import html_page, html_table, render, write_report
+from membrane_ctrl.review.report.json import report_table
+from membrane_ctrl.review.statistics.analysis import Analysis, analyse
+from membrane_ctrl.run_files.run import open_run
+
+SCHEMA = "membrane-fleet-report/1"
+_SAME = (
+    "run", "started_utc", "duration_s", "settled_s", "faults_s", "paused_s", "moving_s", "ticks_missed", "band_um",
+    "verdict", "sentence", "exit",
+)  # fmt: skip
+_STYLE = "main{max-width:none}td svg{width:160px}td:first-child{white-space:normal}"
+
+
+@dataclass(frozen=True, slots=True)
+class FleetOptions:
+    """Options of the command."""
+
+    runs: Sequence[Path]  # runs, or folders of runs
+    out: Path
+    start: str | None
+    end: str | None
+    workers: int | None
+    scheduler: str | None
+    as_json: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """A run's own report, and its line of the fleet's page."""
+
+    line: dict[str, Any]  # with a `problem` instead of figures, if it cannot be reported
+    text: str = ""  # report.json
+    page: str = ""  # report.html
+    curve: str = ""  # the error as a small SVG line
+
+
+def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
+    """Analyse one run, or the same part of each. A run that cannot be reported gives its reason, whatever it is."""
+    try:
+        run = open_run(folder)
+        analysis = analyse(run, *part_s(run.origin_utc, start, end))
+        table = report_table(analysis)
+        text, curve = plain_json.dumps(table, indent=1), sparkline(analysis.level["mean_error_um"])
+        return RunReport(_line(analysis, table), text, render(analysis), curve)
+    except errors.CommandError as error:
+        return RunReport({"problem": "; ".join(error.lines)})
+    except Exception as error:  # one strange folder must not end the reports of the others
+        return RunReport({"problem": f"cannot be reported: {type(error).__name__}: {error}"})
+
+
+def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
+    """The figures of the run's own report that the fleet's page shows, and the names in its event log."""
+    series = table["true"] or table["reading"]
+    seconds = series["windows"][0] if series else {}
+    log = [each.event for each in analysis.run.log]
+    states = [event.state for event in log if isinstance(event, events.StateEntered)]
+    alarms = {event.alarm for event in log if isinstance(event, run_events.AlarmTold) and event.what == "raised"}
+    return {
+        **{name: table[name] for name in _SAME},
+        **{name: seconds.get(name) for name in ("mean_um", "std_um", "in_band")},
+        "of": "true centre" if table["true"] else "reading",
+        "state": states[-1] if states else "",
+        "faults": [line["name"] for line in table["timeline"] if line["kind"] == events.Fault.kind],
+        "alarms": sorted(alarms),
+        "found": len(table["found"]),
+        "anomalies": [anomaly["name"] for anomaly in table["anomalies"]],
+    }
+
+
+def folders_of(given: Sequence[Path]) -> list[Path]:
+    """The runs that are named, or lie in a named folder, each once; a folder without a run stands for itself."""
+    found: list[Path] = []
+    for each in given:
+        folder = catalogue.resolve(each).resolve()
+        inside = [] if catalogue.may_be_run(folder) or not folder.is_dir() else catalogue.folders(folder)
+        found += inside or [folder]
+    return list(dict.fromkeys(found))
+
+
+def fleet_command(options: FleetOptions) -> int:
+    """Write the fleet's page, its figures as JSON, and each run's report; see `membrane-ctrl report --help`."""
+    folders, out = folders_of(options.runs), options.out.resolve()
+    common = Path(os.path.commonpath([folder.parent for folder in folders]))
+    workers = options.workers or min(os.cpu_count() or 1, len(folders))
+    job, rows, lines = partial(run_report, options.start, options.end), [], []
+    with (
+        errors.writing(out, errors.DeviceError, "; choose another folder with --out"),
+        results_of(job, folders, workers, options.scheduler) as results,
+    ):
+        counted = terminal.counted(results, "runs", len(folders))
+        for folder, report in zip(folders, counted, strict=True):
+            name = folder.relative_to(common)
+            line = {"name": str(name), "mirror": folder.parent.name} | report.line
+            if "problem" not in line:
+                line["report"] = str(name / "report.html")
+                write_report(out / name, report.text, report.page)
+            lines.append(line)
+            rows.append(_row(line, report.curve))
+        if all("problem" in line for line in lines):
+            raise errors.InputError(*(f"{line['name']}: {line['problem']}" for line in lines))
+        text = plain_json.dumps({"schema": SCHEMA, "runs": lines}, indent=1)
+        files.make_folder(out)
+        files.write_text_atomic(out / "fleet.json", text + "\n")
+        files.write_text_atomic(out / "fleet.html", _page(lines, rows))
+    if options.as_json:
+        print(text)
+    else:
+        for line in lines:
+            print(terminal.one_line(f"{line['name']}: {line.get('sentence') or line['problem']}"))
+        print(out / "fleet.html")
+    return errors.Exit.DONE
+
+
+_HEAD = (
+    "run", "started, UTC", "error", "state", "held", "std µm", "mean µm", "in band", "faults", "alarms", "events",
+    "ticks missed", "check",
+)  # fmt: skip
+
+
+def _row(line: dict[str, Any], curve: str) -> list[str]:
+    """A row of the page's table; its texts come from files, so they are escaped."""
+    name = escape(line["name"])
+    if "problem" in line:
+        return [name, "", "", "<b>not reported</b>", escape(line["problem"]), *[""] * (len(_HEAD) - 5)]
+    in_band = line["in_band"]
+    share = "–" if in_band is None or in_band != in_band else f"{100 * in_band:.4g} %"
+    rest = beside(line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"])
+    faults = f"{len(line['faults'])}: {', '.join(dict.fromkeys(line['faults']))}" if line["faults"] else "0"
+    return [
+        f"<a href='{quote(line['report'])}'>{name}</a>",
+        f"{datetime.fromisoformat(line['started_utc']):%Y-%m-%d %H:%M}",
+        curve,
+        escape(f"{line['state']}, {line['exit'] or 'open'}"),
+        escape(
+            f"{span(line['settled_s'])} of {span(line['duration_s'])}" + (f" ({', '.join(rest)})" if rest else "")
+        ),
+        *(number(line[key]) for key in ("std_um", "mean_um")),
+        share,
+        escape(faults),
+        escape(", ".join(line["alarms"])) or "none",
+        str(line["found"]),
+        str(line["ticks_missed"]),
+        escape(", ".join(dict.fromkeys(line["anomalies"]))) or "nothing unusual",
+    ]
+
+
+def _page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
+    failed = sum("problem" in line for line in lines)
+    odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
+    mirrors = len({str(Path(line["name"]).parent) for line in lines})
+    said = f"{len(lines)} runs of {mirrors} folders: {odd} to look at, {failed} cannot be reported."
+    word = "bad" if failed else "look" if odd else "good"
+    head = f"<style>{_STYLE}</style><header><h1>Fleet</h1></header><p class='verdict {word}'>{said}</p>"
+    return html_page("Fleet", head + html_table(_HEAD, rows))
