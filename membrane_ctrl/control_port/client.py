@@ -77,7 +77,7 @@ class PortClient:
             secured = context.wrap_socket(plain, server_hostname=host)
         except OSError as error:
             plain.close()
-            raise DeviceError(f"{where}: {error}") from None
+            raise DeviceError(f"{where}: {_tls_reason(error)}") from None
         return cls(secured, where, notice)
 
     def ask(self, **request: Any) -> Message:
@@ -124,7 +124,9 @@ class PortClient:
             raise DeviceError(f"{self._where}: the hold does not answer; is it stopped or overloaded?") from None
         except OSError as error:  # TLS: a refused certificate shows only when reading
             self.close()
-            raise DeviceError(f"{self._where}: {error}") from None
+            refused = isinstance(error, ssl.SSLError)
+            reason = f"{_tls_reason(error)}; check the certificate" if refused else os_reason(error)
+            raise DeviceError(f"{self._where}: {reason}") from None
         if not line.endswith(b"\n"):
             return None
         try:
@@ -134,3 +136,14 @@ class PortClient:
         if not isinstance(message, dict):
             raise DeviceError(f"{self._where}: the answer is not a JSON object")
         return message
+
+
+def _tls_reason(error: OSError) -> str:
+    """Why there is no secure connection, in words."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"the hold's certificate is not trusted: {error.verify_message}"
+    if isinstance(error, TimeoutError):
+        return "no TLS answer; is it a hold's TLS port?"
+    if isinstance(error, ssl.SSLError):
+        return f"no TLS connection ({str(error.reason or 'broken off').lower().replace('_', ' ')})"
+    return os_reason(error)

@@ -134,7 +134,7 @@ async def test_a_bench_of_another_authority_is_not_trusted(
     stranger = Authority.new(tmp_path / "stranger")
     pair = lab.certificate("bea", "operate")
     async with port_run(tmp_path, config) as run:
-        with pytest.raises(DeviceError, match="verify failed"):
+        with pytest.raises(DeviceError, match="the hold's certificate is not trusted"):
             await asyncio.to_thread(greet, run, pair, stranger.own)
 
 
