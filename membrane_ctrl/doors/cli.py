@@ -15,7 +15,7 @@ from membrane_ctrl.model import errors
 if TYPE_CHECKING:
     from membrane_ctrl.doors.names import Door
 
-_LIBRARIES = {"mqtt": "aiomqtt", "opcua": "asyncua", "epics": "softioc"}  # each door's module, and what it needs
+_LIBRARIES = {"opcua": "asyncua", "epics": "softioc", "mqtt": "aiomqtt"}  # each door's module, and what it needs
 
 app = typer.Typer(
     invoke_without_command=True,

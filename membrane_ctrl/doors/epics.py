@@ -26,13 +26,31 @@ _DIGITS = 4
 
 async def serve(config: EpicsConfig, door: Door) -> None:
     """Serve until cancelled. Raises DeviceError if the address is taken."""
+    async with door.opening:
+        records = _opened(config, door)
+    print(f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}", file=sys.stderr, flush=True)
+    from softioc import alarm
+
+    while True:
+        live = door.live
+        for name, value in door.values().items():
+            record = records[name]
+            if value is not None:
+                record.set(_fitting(value))
+            else:
+                record.set_alarm(alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM)
+        await asyncio.sleep(door.settings.period_s)
+
+
+def _opened(config: EpicsConfig, door: Door) -> dict[str, Any]:
+    """Start the IOC, which takes seconds; returns the records of the published values."""
     _require_free(config)
     addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
     addresses |= {"EPICS_CAS_BEACON_ADDR_LIST": config.host, "EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO"}
     addresses |= {"EPICS_PVAS_BEACON_ADDR_LIST": config.host, "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO"}
     os.environ.update(addresses)
     os.environ.update(EPICS_CA_SERVER_PORT=str(config.ca_port), EPICS_PVAS_SERVER_PORT=str(config.pva_port))
-    from softioc import alarm, asyncio_dispatcher, builder, imports, softioc  # they read the environment
+    from softioc import asyncio_dispatcher, builder, imports, softioc  # they read the environment
 
     builder.SetDeviceName(door.settings.name)
     records = {each.name: _record(builder, each.name, each.unit, each.says) for each in TABLE}
@@ -44,16 +62,7 @@ async def serve(config: EpicsConfig, door: Door) -> None:
         files.write_text_atomic(rules, _RULES)
         imports.dbCore.asSetFilename(str(rules).encode())
         softioc.iocInit(asyncio_dispatcher.AsyncioDispatcher(asyncio.get_running_loop()))
-    print(f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}", file=sys.stderr, flush=True)
-    while True:
-        live = door.live
-        for name, value in door.values().items():
-            record = records[name]
-            if value is not None:
-                record.set(_fitting(value))
-            else:
-                record.set_alarm(alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM)
-        await asyncio.sleep(door.settings.period_s)
+    return records
 
 
 def _require_free(config: EpicsConfig) -> None:

@@ -33,6 +33,8 @@ async def serve(config: MqttConfig, door: Door) -> None:
     context = _context(config)
     will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
     told, where = False, f"{config.host}:{config.port}"
+    async with door.opening:
+        pass  # a connection would time out meanwhile
     while True:
         try:
             async with aiomqtt.Client(

@@ -103,6 +103,7 @@ class Door:
         }
         self._answer = ""
         self._turn, self._waiting = asyncio.Lock(), 0
+        self.opening = asyncio.Lock()  # one door after the other: a server blocks the event loop while it opens
 
     @classmethod
     def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Door":

@@ -29,27 +29,33 @@ class _Everybody:
 
 async def serve(config: OpcuaConfig, door: Door) -> None:
     """Serve until cancelled. Raises DeviceError if the address is taken."""
-    server = Server(user_manager=_Everybody())
-    await server.init()
     where = f"opc.tcp://{config.host}:{config.port}/membrane_ctrl"
-    server.set_endpoint(where)
-    server.set_server_name("membrane_ctrl")
-    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-    server.set_identity_tokens([ua.AnonymousIdentityToken])
-    space = await server.register_namespace(f"urn:membrane-ctrl:{door.settings.name}")
-    nodes = await _nodes(server, space, door)
-    try:
-        await server.start()
-    except OSError as error:
-        raise errors.DeviceError(f"opcua: {where}: {errors.os_reason(error)}; choose another port") from None
+    async with door.opening:
+        server = Server(user_manager=_Everybody())
+        await server.init()
+        server.set_endpoint(where)
+        server.set_server_name("membrane_ctrl")
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        server.set_identity_tokens([ua.AnonymousIdentityToken])
+        space = await server.register_namespace(f"urn:membrane-ctrl:{door.settings.name}")
+        nodes = await _nodes(server, space, door)
+        await _show(server, nodes, door)  # nobody may see the zeros that the variables were made with
+        try:
+            await server.start()
+        except OSError as error:
+            raise errors.DeviceError(f"opcua: {where}: {errors.os_reason(error)}; choose another port") from None
     print(f"opcua: {where}", file=sys.stderr, flush=True)
     try:
         while True:
-            for name, value in door.values().items():
-                await server.write_attribute_value(nodes[name].nodeid, _data(name, value, door.live))
+            await _show(server, nodes, door)
             await asyncio.sleep(door.settings.period_s)
     finally:
         await server.stop()
+
+
+async def _show(server: Server, nodes: dict[str, Node], door: Door) -> None:
+    for name, value in door.values().items():
+        await server.write_attribute_value(nodes[name].nodeid, _data(value, door.live))
 
 
 async def _nodes(server: Server, space: int, door: Door) -> dict[str, Node]:
@@ -94,7 +100,7 @@ def _method(door: Door, do: str) -> Any:
     return call
 
 
-def _data(name: str, value: Value, live: bool) -> ua.DataValue:
+def _data(value: Value, live: bool) -> ua.DataValue:
     """A value with its time; without contact, texts stay, and numbers are bad."""
     at = datetime.now(UTC)
     if value is not None:
