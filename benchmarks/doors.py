@@ -355,7 +355,7 @@ def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
     for name in CLIENTS:
         sweeps = [line for line in lines(folder / f"{name}.jsonl") if begin_s <= line["utc_s"] < end_s]
         back_s, between, first = [], [], True
-        events = [line for line in told if begin_s <= line["utc_s"] < end_s]
+        events = [line for line in told if begin_s < line["utc_s"] < end_s]
         returns = [line["utc_s"] for line in events if name in _affected(line.get("started", ""))]
         kills = [line["utc_s"] for line in events if name in _affected(line.get("killed", ""))]
         for at_s, until_s in zip([begin_s, *returns], [*kills, end_s], strict=False):
