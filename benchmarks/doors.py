@@ -99,7 +99,7 @@ def _mqtt(tell: Told, ports: dict[str, int]) -> None:
                 async with aiomqtt.Client("127.0.0.1", ports["mqtt"]) as client:
                     await client.subscribe("membrane/mirror/values")
                     async for message in client.messages:
-                        newest.update(json.loads(message.payload))  # type: ignore[arg-type]
+                        newest.update(json.loads(message.payload))
             except aiomqtt.MqttError as error:
                 newest["problem"] = str(error)
             await asyncio.sleep(0.2)
