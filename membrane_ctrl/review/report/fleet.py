@@ -59,7 +59,7 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
         text, curve = plain_json.dumps(table, indent=1), sparkline(analysis.level["mean_error_um"])
         return RunReport(_line(analysis, table), text, render(analysis), curve)
     except errors.CommandError as error:
-        return RunReport({"problem": "; ".join(error.lines)})
+        return RunReport({"problem": "; ".join(error.lines).removeprefix(f"{folder}: ")})
     except Exception as error:  # one strange folder must not end the reports of the others
         return RunReport({"problem": f"cannot be reported: {type(error).__name__}: {error}"})
 
@@ -163,8 +163,7 @@ def _row(line: dict[str, Any], curve: str) -> list[str]:
 def _page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in line for line in lines)
     odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
-    mirrors = len({str(Path(line["name"]).parent) for line in lines})
-    said = f"{len(lines)} runs of {mirrors} folders: {odd} to look at, {failed} cannot be reported."
+    said = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."
     word = "bad" if failed else "look" if odd else "good"
     head = f"<style>{_STYLE}</style><header><h1>Fleet</h1></header><p class='verdict {word}'>{said}</p>"
     return html_page("Fleet", head + html_table(_HEAD, rows))
