@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -87,8 +88,10 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     """The runs that are named, or lie in a named folder, each once; a folder without a run stands for itself."""
     found: list[Path] = []
     for each in given:
-        folder = catalogue.resolve(each).resolve()
-        inside = [] if catalogue.may_be_run(folder) or not folder.is_dir() else catalogue.folders(folder)
+        folder, inside = catalogue.resolve(each).resolve(), []
+        if folder.is_dir() and not catalogue.may_be_run(folder):
+            with suppress(OSError):  # its line will tell
+                inside = catalogue.folders(folder)
         found += inside or [folder]
     return list(dict.fromkeys(found))
 
