@@ -35,6 +35,7 @@ from membrane_ctrl.doors.names import TABLE
 NAMES = [each.name for each in TABLE]
 CLIENTS = ("mqtt", "opcua", "ca", "pva")
 SWEEP_S, FRESH_S, RATE_HZ, SAMPLE_S = 0.5, 2.0, 50.0, 5.0
+BETWEEN_S = 20.0  # at least, from a return to the next end
 WARM_S = 60.0  # memory is compared from here on
 RAISED = "-5"  # of the session, against everything else on the machine
 CONFIG = """[twin]
@@ -292,7 +293,7 @@ def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) ->
         bench.tell(phase="doors")
         begin_s = time.monotonic()
         for restart in restarts(60.0 * minutes):
-            bench.wait(begin_s + restart.at_s)
+            bench.wait(max(begin_s + restart.at_s, time.monotonic() + BETWEEN_S))
             bench.kill(restart.who)
             bench.wait(time.monotonic() + restart.away_s)
             bench.start(restart.who)
