@@ -101,17 +101,21 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     """
     folder, shape_s = _named(name, logs)
     config = toml_file.load(path, schema.Config)
-    gains, pump = config.loop, config.pump
+    gains, pump, keys = config.loop, config.pump, GAIN_KEYS
     if shape_s is None or folder.done("verify") or pump_trial.mapped(folder):
         gains, pump = _kept(folder), folder.config.pump
-        replaces = pump_trial.mapped(folder) and config.pump == pump_trial.mapped_of(folder).before
-        _require_same_bench(path, config.model_copy(update={"pump": pump}) if replaces else config, folder)
+        same = config
+        if pump_trial.mapped(folder) and config.pump == pump_trial.mapped_of(folder).before:
+            keys = (*keys, "flow_max_um_per_s")  # comes with the curve
+            loop = config.loop.model_copy(update={"flow_max_um_per_s": gains.flow_max_um_per_s})
+            same = config.model_copy(update={"pump": pump, "loop": loop})
+        _require_same_bench(path, same, folder)
     else:
         _require_same_devices(path, config, folder)
     before = files.read_text(path, follow=True)
     shape = config.shape.model_copy(update={"time_constant_s": shape_s or config.shape.time_constant_s})
     changed = {
-        "loop": _changes(config.loop, gains, GAIN_KEYS),
+        "loop": _changes(config.loop, gains, keys),
         "pump": _changes(config.pump, pump),
         "shape": _changes(config.shape, shape),
     }

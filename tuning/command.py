@@ -200,7 +200,8 @@ def rollback(options: TuneOptions) -> int:
         rig = HoldRig(link, options.author, progress)
         try:
             shape_s = kept.shape_s[0] if kept.shape_s else math.nan
-            rig.set_gains(kept.before, f"rollback of {kept.session}: {options.reason}"[:250], shape_s=shape_s)
+            loop = gains_file.for_hold(kept.before, rig.loop)
+            rig.set_gains(loop, f"rollback of {kept.session}: {options.reason}"[:250], shape_s=shape_s)
         except HoldError as error:
             raise DeviceError(str(error)) from None
     told_of = (kept.session, options.author, options.reason, kept.before, kept.after, None, kept.shape_s)

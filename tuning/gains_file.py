@@ -98,10 +98,12 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
         )
 
 
+_NO_GAINS = {"setpoint_um", "bleed_fraction", "flow_max_um_per_s"}
+
+
 def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
-    """The gains for a hold, which keeps its own setpoint and bleed: those are not gains."""
-    kept = {"setpoint_um": running.setpoint_um, "bleed_fraction": running.bleed_fraction}
-    return LoopConfig.model_validate(gains.model_dump() | kept)
+    """The gains for a hold, which keeps its own setpoint, bleed and limit of the flow: those are not gains."""
+    return LoopConfig.model_validate(gains.model_dump() | running.model_dump(include=_NO_GAINS))
 
 
 # `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.

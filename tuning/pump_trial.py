@@ -58,8 +58,9 @@ def map_pump(
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
     try:
         found = _surveyed(rig, limit_um)
-        found = replace(found, pump=found.pump.model_copy(update={"probe_um": before.probe_um}))
-        loop = _safe(rig.good[0], found)
+        watched = before.model_dump(include={"probe_um", "change_max"})
+        found = replace(found, pump=found.pump.model_copy(update=watched))
+        loop = _safe(_freed(rig.good[0], before, found.pump), found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
         gain, sigma = _checked(rig)
     except (characterise.ExperimentError, ValueError) as error:
@@ -91,6 +92,15 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
             raise ValueError(finished.reason)
         _returned(rig)
     return survey.result()
+
+
+def _freed(loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig) -> schema.LoopConfig:
+    """The loop with the flow of the measured pump, unless its limit was below what the pump was taken for."""
+    if loop.flow_max_um_per_s < before.flow_full_um_per_s:
+        return loop  # somebody wants it gentle
+    # from none to full within two seconds, as `check` demands
+    most_um_per_s = min(pump.flow_full_um_per_s, 2.0 * loop.flow_rate_limit_um_per_s2)
+    return loop.model_copy(update={"flow_max_um_per_s": most_um_per_s})
 
 
 def _safe(loop: schema.LoopConfig, found: pump_survey.PumpMap) -> schema.LoopConfig:

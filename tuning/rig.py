@@ -93,7 +93,7 @@ def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float)
     return machine.Around(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
         least_flow_um_per_s=gas.PumpCurve(pump).least_flow_um_per_s,
-        full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
+        full_flow_um_per_s=loop.flow_most_um_per_s(pump),
         laser_um=laser_noise_um(held),
         limit_um=limit_um,
     )

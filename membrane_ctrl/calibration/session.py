@@ -221,7 +221,7 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
 
 def way_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
     """Duration of the setpoint's ramp; inf if the mirror does not sink, or the pump has no reserve."""
-    loop, most_um_per_s = config.loop, min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
+    loop, most_um_per_s = config.loop, config.loop.flow_most_um_per_s(config.pump)
     total_s = 0.0
     for a_um, b_um in pairwise(np.linspace(from_um, to_um, _PIECES + 1).tolist()):
         leak_um_per_s = held.leak_at_um_per_s((a_um + b_um) / 2)

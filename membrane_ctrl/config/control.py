@@ -29,7 +29,8 @@ class LoopConfig(Section):
     measurement_filter_s: Annotated[float, Field(ge=0, le=10)] = 0.2
     """Time constant of the filter on the laser reading; 0 for none. Change it with `tune`."""
     flow_max_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
-    """Largest flow that the loop may command. Lower it to inflate or correct more gently."""
+    """Largest flow that the loop may command; a measured curve brings its own.
+    Lower it to inflate or correct more gently."""
     flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 20.0
     """Fastest change of the flow. Lower it for a drive that must not be stepped."""
     setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
@@ -48,6 +49,10 @@ class LoopConfig(Section):
     """Filter on the weather sensors. Raise it for noisy sensors, at the cost of a later correction."""
     bleed_fraction: Fraction = 0.0
     """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 um/s)."""
+
+    def flow_most_um_per_s(self, pump: "PumpConfig") -> float:
+        """The largest flow that the loop commands: within its own limit and the pump's."""
+        return min(self.flow_max_um_per_s, pump.flow_full_um_per_s)
 
     @model_validator(mode="after")
     def _filter_slower_than_tick(self) -> "LoopConfig":

@@ -8,9 +8,10 @@ when to change it. Everything that explains the configuration is made from these
 """
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from firmware_iface import settings
 from firmware_iface.settings import Section
@@ -220,3 +221,14 @@ class Config(Section):
             if bits != self.optics.camera.bits:
                 raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
         return self
+
+    def with_gains(self, told: Mapping[str, Any] | None) -> "Config":
+        """This configuration with the gains, and the pump's curve, of an event; as it is if they do not fit."""
+        told = told or {}
+        loop_told = {key: told[key] for key in LoopConfig.model_fields if key in told}
+        try:
+            loop = LoopConfig.model_validate(self.loop.model_dump() | loop_told)
+            pump = PumpConfig.model_validate(told.get("pump", self.pump))
+        except ValidationError:
+            return self
+        return self.model_copy(update={"loop": loop, "pump": pump})

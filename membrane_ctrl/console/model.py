@@ -89,6 +89,7 @@ class ConsoleView:
     last_fault: str  # the newest of them, with its time
     too_tight: bool  # the leak is too small for the band
     gains: str  # in force, with the countdown of a trial
+    flow_most_um_per_s: float  # with the curve in force
     recording: str  # what prevents recording; empty if nothing does
     events: tuple[events.EventLine, ...]  # the last ones, oldest first
     shape: ShapeView
@@ -150,6 +151,7 @@ class ConsoleModel:
     def view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
+        in_force = self._config.with_gains(status.loop)
         errors = self._error.values()
         band_um = self._config.limits.band_um
         age_s = now_s - row.mono_s if row else 0.0
@@ -173,7 +175,8 @@ class ConsoleModel:
             faults=status.faults,
             last_fault=f"{_fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
             too_tight=self._too_tight(now_s),
-            gains=telemetry.gains_words(status.loop or self._config.loop.model_dump(), status.trial_left_s),
+            gains=telemetry.gains_words(vars(in_force.loop), status.trial_left_s),
+            flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
             recording=status.recording_words,
             events=tuple(self._events),
             shape=self._shape(now_s),

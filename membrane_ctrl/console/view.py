@@ -187,7 +187,7 @@ def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]
         *trend,
         ("mirror", _mirror(row)),
         ("gains", Text(view.gains)),
-        ("pump", _pump(row, config)),
+        ("pump", _pump(row, view.flow_most_um_per_s)),
         ("flow", _flow(row)),
         ("gas", _gas(view, row)),
         ("", Text()),
@@ -234,10 +234,10 @@ def _mirror(row: telemetry.TelemetryRow) -> Text:
     return text
 
 
-def _pump(row: telemetry.TelemetryRow, config: Config) -> Text:
+def _pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
     text = level_bar(row.pump_fraction, _BAR_WIDTH)
     text.append(f" {percent(row.pump_fraction)}, {number(row.flow_um_per_s, 2)} of ", style="default")
-    text.append(f"{config.loop.flow_max_um_per_s:g} um/s", style="default")
+    text.append(f"{most_um_per_s:g} um/s", style="default")
     if row.vent_fraction > 0:
         text.append(f"  vent {percent(row.vent_fraction)} open", style="yellow")
     return text

@@ -112,6 +112,10 @@ class FilmHealth:
         self._warned: set[str] = set()
         self._begin_hour()
 
+    def set_pump(self, flow_max_um_per_s: float) -> None:
+        """The pump in force gives this much from now on."""
+        self._flow_max_um_per_s = flow_max_um_per_s
+
     def step(self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float) -> tuple[FilmWarning, ...]:
         """Process one tick of a held mirror; at the end of an hour, return new and withdrawn warnings."""
         if not (math.isfinite(leak_um_per_s) and math.isfinite(gauge_pressure_pa)):
@@ -185,6 +189,10 @@ class PumpHealth:
         self._change_max = change_max
         self._count = 0
         self._warned = False
+
+    def set_pump(self, change_max: float) -> None:
+        """Another curve is in force, with this limit of its drift."""
+        self._change_max = change_max
 
     def step(self, known: PumpScale) -> tuple[bool, tuple[FilmWarning, ...]]:
         """Take a segment's estimate; returns whether to report it, and a new or withdrawn warning."""

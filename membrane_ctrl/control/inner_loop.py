@@ -62,7 +62,7 @@ class InnerLoop:
         self._error_gain_per_s = lag_s * estimator.gain_per_s * fast_per_s if lag_s > 0 else estimator.gain_per_s
         self._due_gain = (1 - lag_s * estimator.gain_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
-        flow_max_um_per_s = min(loop.flow_max_um_per_s, pump.flow_full_um_per_s)
+        flow_max_um_per_s = loop.flow_most_um_per_s(pump)
         self._measured = filters.LowPass(loop.measurement_filter_s)
         # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
         self._matched = filters.LowPass(loop.measurement_filter_s)

@@ -121,8 +121,9 @@ def refusal(command: Command, state: State, config: Config) -> str:
         low, high = config.limits.displacement_min_um, config.limits.displacement_max_um
         if not low < command.value < high:
             return f"setpoint {command.value:g} um is outside the limits ({low:g} .. {high:g} um)"
-    if command.kind == "manual" and not 0.0 <= command.value <= config.loop.flow_max_um_per_s:
-        return f"flow {command.value:g} um/s is outside 0 .. {config.loop.flow_max_um_per_s:g} um/s"
+    most_um_per_s = config.loop.flow_most_um_per_s(config.pump)
+    if command.kind == "manual" and not 0.0 <= command.value <= most_um_per_s:
+        return f"flow {command.value:g} um/s is outside 0 .. {most_um_per_s:g} um/s"
     if command.kind == "tune" and command.experiment is None:
         return "tune: experiment missing"
     if command.kind == "gains" and command.loop is None:

@@ -69,6 +69,10 @@ class Controller:
         """The pump's curve in force."""
         return self._scene.pump_config
 
+    @property
+    def _in_force(self) -> Config:
+        return self._config.model_copy(update={"loop": self.loop_config, "pump": self.pump_config})
+
     def tick(self, inputs: TickInputs) -> TickOutputs:
         """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
         scene = self._scene
@@ -146,7 +150,7 @@ class Controller:
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
-            commands.refusal(command, self.state, self._config)
+            commands.refusal(command, self.state, self._in_force)
             or commands.overruled(command, obeyed)
             or self._prepare(command)
         )
@@ -194,7 +198,7 @@ class Controller:
         if math.isfinite(command.setpoint_step_um):
             now_um = self._setpoint_back_um if math.isfinite(self._setpoint_back_um) else scene.setpoint_um
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
-            return commands.refusal(stepped, self.state, self._config)
+            return commands.refusal(stepped, self.state, self._in_force)
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
@@ -212,6 +216,7 @@ class Controller:
         scene.loop_config, scene.pump_config = loop, pump
         scene.loop.set_gains(loop)
         self._holders.set_gains(loop)
+        self._consistency.set_gains(loop, pump)
         self._shape.set_memory(self._gains.shape_time_constant_s)
         self._step_setpoint()
 

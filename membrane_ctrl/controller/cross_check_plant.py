@@ -65,7 +65,7 @@ class ConfigFindings:
 
 
 def flow_um_per_s(config: Config) -> float:
-    return min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s)
+    return config.loop.flow_most_um_per_s(config.pump)
 
 
 def judge_pump(config: Config, say: ConfigFindings) -> None:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import film, film_health, gas, inner_loop
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
@@ -64,7 +64,7 @@ class SensorConsistency:
     def __init__(self, config: Config) -> None:
         self._plausibility = film.PlausibilityCheck(config.shape.disagreement_max_um)
         self._far_um = config.shape.disagreement_max_um
-        self._health = film_health.FilmHealth(min(config.loop.flow_max_um_per_s, config.pump.flow_full_um_per_s))
+        self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump))
         self._pump = film_health.PumpHealth(config.pump.change_max)
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)
         self._growth = film.LeakGrowth()
@@ -100,6 +100,11 @@ class SensorConsistency:
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
         events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
         return events
+
+    def set_gains(self, loop: LoopConfig, pump: PumpConfig) -> None:
+        """Judge by the gains and the curve that are now in force."""
+        self._health.set_pump(loop.flow_most_um_per_s(pump))
+        self._pump.set_pump(pump.change_max)
 
     def told_of_pump(self, loop: inner_loop.InnerLoop) -> list[Event]:
         """Events on what a segment of probing has told of the pump."""

@@ -274,7 +274,7 @@ def _test_actuators(scene: Scene) -> State:
     if scene.test is None:
         vents = reading is not None and math.isfinite(reading.vent_fraction)
         tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
-        scene.test = pump_obeys.ActuatorTest(scene.config.pump, vents and tense, scene.config.loop.rate_hz)
+        scene.test = pump_obeys.ActuatorTest(scene.pump_config, vents and tense, scene.config.loop.rate_hz)
     scene.test.step(scene.observer.displacement_um, scene.dt_s)
     part = scene.test.part
     if part is not None:

@@ -206,7 +206,9 @@ class RunStatus:
                 return replace(self, fault=None)
             case events.ShapeLoopState():
                 return replace(self, shape_reason=event.reason)
-            case events.CommandTaken(command="gains", refused=None, loop=loop, value=trial_s):
+            case events.CommandTaken(command="gains", refused=None, loop=dict() as told, value=trial_s):
+                # the pump's curve stays when gains change
+                loop: dict[str, Any] = {**(self.loop or {}), **told}
                 kept = self.kept_loop if trial_s is not None else loop
                 ends_s = math.nan if trial_s is None else mono_s + trial_s
                 return replace(self, loop=loop, kept_loop=kept, trial_ends_s=ends_s)

@@ -177,3 +177,8 @@ def test_gains_in_force_and_the_countdown_of_a_trial_are_shown() -> None:
     given.take_event(asked | {"loop": gains | {"kp_per_s": 0.7}, "value": 60.0})
     given.take_event({"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 70.0})
     assert given.view(70.0).gains == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s"
+    curve = {"curve_fraction": [0.1, 1.0], "curve_um_per_s": [0.0, 9.0]}
+    given.take_event(asked | {"loop": gains | {"flow_max_um_per_s": 20.0, "pump": curve}, "value": 60.0})
+    assert given.view(80.0).flow_most_um_per_s == 9.0
+    given.take_event({"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 90.0})
+    assert given.view(90.0).flow_most_um_per_s == 5.3

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.pump_drift import PumpScale
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.memory import recall, remember
@@ -340,7 +341,8 @@ TWICE = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 10.6), flow_f
 
 
 def on_curve(pump: PumpConfig, trial_s: float) -> Command:
-    return replace(gains(0.3, trial_s), pump=pump)
+    loop = LoopConfig(kp_per_s=0.3, flow_max_um_per_s=pump.flow_full_um_per_s)
+    return replace(gains(0.3, trial_s), loop=loop, pump=pump)
 
 
 def mean_flow(held: Held) -> float:
@@ -370,6 +372,34 @@ def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recal
     again = recall(remember(controller), Controller(CONFIG, zernike_projection()))
     assert again.pump_config == TWICE
     assert again._scene.loop._curve.flow(1.0) == 10.6
+
+
+def test_the_flow_of_the_curve_in_force_bounds_what_a_person_may_ask_for() -> None:
+    held = Held()
+    asked = Command("manual", "tester", value=8.0)
+    held.go(0.1, asked)
+    assert held.of("command")[-1]["refused"] == "flow 8 um/s is outside 0 .. 5.3 um/s"
+    held.go(0.1, on_curve(TWICE, 10.0))
+    held.go(0.1, asked)
+    assert "refused" not in held.of("command")[-1]
+    held.go(0.1, Command("hold", "tester"))
+    held.go(10.0)
+    held.go(0.1, asked)
+    assert held.of("command")[-1]["refused"] == "flow 8 um/s is outside 0 .. 5.3 um/s"
+
+
+def test_the_reserve_is_judged_by_the_curve_in_force() -> None:
+    held = Held()
+    consistency = held._run._supervisor._controller._consistency
+    weak = on_curve(TWICE.model_copy(update={"flow_full_um_per_s": 2.0, "change_max": 0.3}), 10.0)
+    held.go(0.1, weak)
+    (told,) = consistency._health.step(3600.0, 1.24, 600.0)
+    assert (told.name, told.message) == ("pump_reserve", "the leak takes 62 % of the pump")
+    assert not consistency._pump.step(PumpScale(0.75, 0.01))[1]
+    held.go(10.5)  # the former curve and its limits are back
+    (told,) = consistency._health.step(3600.0, 1.24, 600.0)
+    assert (told.name, told.bad) == ("pump_reserve", False)
+    assert consistency._pump.step(PumpScale(0.75, 0.01))[1][0].bad
 
 
 def test_the_events_of_older_commands_have_no_new_keys() -> None:

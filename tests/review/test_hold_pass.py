@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -126,3 +127,23 @@ def test_a_flow_that_only_lags_is_not_at_a_limit(tmp_path: Path) -> None:
     rows[1::4, COLUMN["flow_wanted_um_per_s"]] = CONFIG.loop.flow_max_um_per_s + 0.1
     write_run(tmp_path / "run", iter([(rows, [])]))
     assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> None:
+    """A curve of 10 um/s from a third of the run to two thirds; gains change meanwhile."""
+    rows, _ = night(1, HOURS, "quiet", [])
+    rows[:, COLUMN["flow_wanted_um_per_s"]] = 8.0
+    write_run(tmp_path / "run", iter([(rows, [])]))
+    third_s = float(rows[-1, COLUMN["mono_s"]]) / 3
+    curve = {"curve_fraction": [0.1, 1.0], "curve_um_per_s": [0.0, 10.0]}
+    asked = {"kind": "command", "command": "gains", "who": "tom", "why": "", "value": 1e4, "refused": None}
+    loop = CONFIG.loop.model_dump() | {"flow_max_um_per_s": 10.0}
+    told = [
+        asked | {"mono_s": third_s, "loop": loop | {"pump": curve}},
+        asked | {"mono_s": 1.5 * third_s, "loop": loop | {"kp_per_s": 0.5}},
+        asked | {"mono_s": 1.6 * third_s, "loop": "damaged"},
+        {"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 2 * third_s},
+    ]
+    with (tmp_path / "run/events.jsonl").open("a") as log:
+        log.writelines(json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n" for event in told)
+    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(2 / 3, abs=1e-2)

@@ -23,10 +23,12 @@ from rerun.chunk import RrdReader
 
 from benchmarks.nights import Planted, night
 from membrane_ctrl.cli import run as command
+from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import Filter, entries, moment_s, number, one_line, resolve, span, to_prune
+from membrane_ctrl.review.report.json import pump_change, pump_history
 from membrane_ctrl.review.runs import export
 from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
@@ -46,6 +48,54 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         set_summary(run, held={"std_um": std, "in_band": 1.0})
     (folder / "notes").mkdir()
     return folder
+
+
+def week(logs: Path, number: int, scale: float, sigma: float = 0.03, devices: str = "", curve: str = "") -> Path:
+    """A run that has learned its pump, from its small files only; `curve` is set before."""
+    run = logs / f"2026100{number}T120000Z-week"
+    run.mkdir(parents=True)
+    (run / "config.toml").write_text("[pump]\ncurve_fraction = [0, 1]\ncurve_um_per_s = [0, 6]\n" + devices)
+    told: list[dict[str, object]] = [{"kind": "pump", "scale": 9.0, "sigma": 0.1, "correction": 1.0}]
+    if curve:
+        gains = LoopConfig().model_dump() | {"pump": json.loads(curve)}
+        told.append({"kind": "command", "command": "gains", "who": "eve", "why": "", "loop": gains})
+    told.append({"kind": "pump", "scale": scale, "sigma": sigma, "correction": 1.0})
+    lines = [{"time_utc": f"2026-10-0{number}T12:00:00+00:00", "mono_s": 0.0, **event} for event in told]
+    (run / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (run / "summary.json").write_text(
+        json.dumps({"schema": "membrane-summary/2", "leak_um_per_s": 1.0 + 0.1 * number})
+    )
+    return run
+
+
+# twice the flow at every command: what was 1.0 on the first curve is 0.5 on this one
+TWICE = '{"curve_fraction": [0.0, 1.0], "curve_um_per_s": [0.0, 12.0]}'
+
+
+def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
+    twin = "[twin]\nleak_um_per_s = 2.0\n"  # not the bench: its devices are the same
+    week(tmp_path, 1, 1.0)
+    week(tmp_path, 2, 0.97, devices=twin)
+    third = week(tmp_path, 3, 0.80)
+    week(tmp_path, 4, 0.5)
+    seen = pump_history(third)
+    assert [round(each.scale, 3) for each in seen] == [1.0, 0.97, 0.8]  # the later run is not known yet
+    assert [round(each.leak_um_per_s, 3) for each in seen] == [1.1, 1.2, 1.3]
+    assert [each.started_utc.day for each in seen] == [1, 2, 3]
+    said = "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune pump`"
+    assert pump_change(seen, 0.12) == said
+    assert pump_change(seen, 0.25) == ""
+    assert pump_change([], 0.12) == ""
+
+
+def test_a_change_within_its_error_or_of_another_curve_is_none(tmp_path: Path) -> None:
+    week(tmp_path, 1, 1.0, sigma=0.1)
+    vague = pump_history(week(tmp_path, 2, 0.8, sigma=0.1))
+    assert pump_change(vague, 0.12) == ""
+    anew = pump_history(week(tmp_path, 3, 0.98, curve=TWICE))
+    assert [round(each.scale, 3) for each in anew] == [0.5, 0.4, 0.98]
+    assert [each.same_curve for each in anew] == [False, False, True]
+    assert pump_change(anew, 0.12) == ""
 
 
 def test_the_catalogue_lists_and_filters(logs: Path) -> None:

@@ -223,7 +223,8 @@ def mapped_session(logs: Path, text: str) -> Path:
     session = plain.create_session(logs, "s2", "eve", "a-run", config, config.loop)
     found = PumpMap((0.1, 1.0), (0.0, 6.0), (0.0, 0.1), CURVE, 1.2, 1.0, 0.2, 600.0, True)
     plain.write(session.file("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02))
-    return plain.based_on(session, config.loop.model_copy(update={"kp_per_s": 0.3}), CURVE).path
+    loop = config.loop.model_copy(update={"kp_per_s": 0.3, "flow_max_um_per_s": 6.0})
+    return plain.based_on(session, loop, CURVE).path
 
 
 def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
@@ -234,7 +235,7 @@ def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
     assert saved(path, str(session), "--yes", text=text) == Exit.DONE
     now = load(path, Config)
     assert now.pump == CURVE
-    assert now.loop.kp_per_s == 0.3
+    assert (now.loop.kp_per_s, now.loop.flow_max_um_per_s) == (0.3, 6.0)
     assert "# agreed with optics" in path.read_text()
     capsys.readouterr()
     assert run(["tune", "save", "--config", str(path), str(session)]) == Exit.DONE

@@ -13,6 +13,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.control.gas import PumpCurve
+from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
@@ -199,6 +200,38 @@ def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
     model = PlantModel(1.0, 1.2, 0.3, 1.24)
     assert margins(Gains.of(safe), model, 0.02).ms < 1.75
     assert not margins(Gains.of(loop), model, 0.02).ms < 1.75
+
+
+@pytest.mark.parametrize(
+    ("limit", "rate_limit", "full", "after"),
+    [(5.3, 20.0, 15.9, 15.9), (6.0, 20.0, 2.0, 2.0), (5.3, 20.0, 60.0, 40.0), (3.0, 20.0, 15.9, 3.0)],
+)
+def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_one(
+    limit: float, rate_limit: float, full: float, after: float
+) -> None:
+    loop = LoopConfig(flow_max_um_per_s=limit, flow_rate_limit_um_per_s2=rate_limit)
+    pump = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full))
+    freed = pump_trial._freed(loop, PumpConfig(), pump)
+    assert freed == loop.model_copy(update={"flow_max_um_per_s": after})
+    found = cross_check(Config(loop=freed, pump=pump))
+    assert not [each for each in found if each.severity == "error" and "flow" in each.field]
+
+
+@pytest.mark.campaign
+def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pump is three times as strong as configured: the leak seems to be 2.2 um/s until there is a curve."""
+    plant = ForeignPlant(ForeignPump("straight", 15.9), laser_um=0.4, weather=0.3, leak_um_per_s=6.5)
+    link, rig, folder = started(tmp_path, plant, rate_hz=10.0)
+    true = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 15.9), start_fraction=0.1, stall_fraction=0.1)
+    rig.pump = rig.pump.model_copy(update={"probe_um": 0.1, "change_max": 0.3})
+    monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(true))
+    done, folder = pump_trial.map_pump(folder, rig)
+    assert (done.found.pump.probe_um, done.found.pump.change_max) == (0.1, 0.3)
+    assert folder.config.loop.flow_max_um_per_s == rig.loop.flow_max_um_per_s == 15.9
+    rig.hold(60.0)
+    assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])
 
 
 @pytest.mark.campaign

@@ -89,7 +89,7 @@ class Trial:
         around = machine.Around(
             holding_flow_um_per_s=spec.holding_flow_um_per_s,
             least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
-            full_flow_um_per_s=min(pump.flow_full_um_per_s, loop.flow_max_um_per_s),
+            full_flow_um_per_s=loop.flow_most_um_per_s(pump),
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
             stretch=machine.quiet_stretch(spec.laser_um, spec.limit_um, loop.rate_hz),

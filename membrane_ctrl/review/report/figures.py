@@ -3,7 +3,7 @@
 import io
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,7 +15,7 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.catalogue import one_line, span
-from membrane_ctrl.review.report.json import timeline
+from membrane_ctrl.review.report.json import PumpSeen, timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.run_files.shapes import without_terms
@@ -222,6 +222,22 @@ def distributions(analysis: Analysis) -> str:
         for plot in (allan, spectrum):
             if plot.lines:
                 plot.legend(loc="best")
+        return svg(figure)
+
+
+def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
+    """The pump against the newest run's curve over the runs of the bench, and the leak of each."""
+    first = next(seen for seen in history if seen.same_curve)
+    days = [seen.started_utc for seen in history]
+    with picture(1, 2, 2.6) as (figure, (scale, leak)):
+        scale.errorbar(days, [s.scale for s in history], [s.sigma for s in history], fmt="o-", color=BLUE, ms=4)
+        for limit in (1 - change_max, 1 + change_max):
+            scale.axhline(first.scale * limit, color=RED, lw=0.8, ls="--")
+        scale.set(title="Pump's flow against its curve ± 1 σ")
+        leak.plot(days, [s.leak_um_per_s for s in history], "o-", color=ORANGE, ms=4)
+        leak.set(title="Leak, with any offset of the curve, µm/s")
+        for plot in (scale, leak):
+            plot.tick_params(axis="x", rotation=20)
         return svg(figure)
 
 

@@ -14,7 +14,7 @@ from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import report_table, timeline, verdict
+from membrane_ctrl.review.report.json import PumpSeen, pump_change, pump_history, report_table, timeline, verdict
 from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
 from membrane_ctrl.run_files.run import Run, open_run
@@ -56,8 +56,16 @@ READING, TRUE = "reading (in the loop)", "true centre (twin)"
 _HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
 
 
-def render(analysis: Analysis, other: Analysis | None = None, differences: Sequence[compare.Difference] = ()) -> str:
-    """HTML of a report, optionally with another run and the differences from it (`compare.compare`)."""
+def render(
+    analysis: Analysis,
+    other: Analysis | None = None,
+    differences: Sequence[compare.Difference] = (),
+    history: Sequence[PumpSeen] = (),
+) -> str:
+    """HTML of a report, optionally with another run and the differences from it (`compare.compare`).
+
+    `history`: the pump in this and earlier runs (`pump_history`).
+    """
     run = analysis.run
     word, sentence = verdict(analysis)
     parts = [
@@ -78,6 +86,8 @@ def render(analysis: Analysis, other: Analysis | None = None, differences: Seque
         parts.append(f"<figure>{figures.stability(analysis.shape)}</figure>")
         if analysis.shape.pairs:
             parts.append(f"<figure>{figures.pairs(analysis.shape)}</figure>")
+    if len(history) > 1:
+        parts.append(_section("Pump over the runs", _history(history, run.config.pump.change_max)))
     if other is not None:
         parts.append(_section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences)))
         parts.append(f"<figure>{figures.overview(other)}</figure>")
@@ -177,6 +187,22 @@ def _pump(analysis: Analysis) -> str:
     return _facts(facts)
 
 
+def _history(history: Sequence[PumpSeen], change_max: float) -> str:
+    rows = [
+        [
+            f"{seen.started_utc:%Y-%m-%d %H:%M}",
+            _text(seen.run),
+            f"{seen.scale:.3f} ± {seen.sigma:.3f}",
+            number(seen.leak_um_per_s),
+        ]
+        for seen in history[-_LINES_MOST:]
+    ]
+    said = pump_change(history, change_max)
+    warning = f"<ul class='odd'><li><b>pump</b> {_text(said)}</li></ul>" if said else ""
+    table = _table(["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows)
+    return f"{warning}<figure>{figures.pump_history(history, change_max)}</figure>{table}"
+
+
 def _shape(shape: shape_review.ShapeReview) -> str:
     drifting = [
         f"Z{j} {_slope(term, 'µm/h')}" for j, term in enumerate(shape.drift_um_per_hour, 2) if term.significant
@@ -272,7 +298,8 @@ def report_command(
     analysis = analyse(opened, *part_s(opened.origin_utc, start, end))
     other = None if compare_with is None else _other(open_run(catalogue.resolve(compare_with)), start, end)
     differences = [] if other is None else compare.compare(analysis, other)
-    table = report_table(analysis)
+    history = pump_history(opened.folder)
+    table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
     if other is not None:
         table["compared_with"] = {
             "run": other.run.name,
@@ -282,13 +309,15 @@ def report_command(
         }
     folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
     text = plain_json.dumps(table, indent=1)
-    page = render(analysis, other, differences)
+    page = render(analysis, other, differences, history)
     with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
         write_report(folder, text, page)
     if json:
         print(text)
-    else:
-        _say(analysis, other, folder, time.monotonic() - began_s)
+        return 0
+    _say(analysis, other, folder, time.monotonic() - began_s)
+    if said := pump_change(history, opened.config.pump.change_max):
+        print(f"note: {said}", file=sys.stderr)
     return 0
 
 

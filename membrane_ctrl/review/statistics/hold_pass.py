@@ -8,7 +8,7 @@ import numpy as np
 
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
-from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.model.telemetry import RunStatus, State
 from membrane_ctrl.review.statistics import spectra
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
@@ -187,7 +187,7 @@ class _Collector:
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
         self._lateness = summary.LogHistogram()
-        self._pump = _PumpSums(loop.flow_max_um_per_s)
+        self._pump = _PumpSums(run)
         self._ticks = self._counted = self._unread = self._inside = 0
         self._times = {name: spectra.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
         self.thin = ThinSeconds(loop.rate_hz)
@@ -267,8 +267,8 @@ class _Collector:
 class _PumpSums:
     """Sums behind `PumpActivity`."""
 
-    def __init__(self, flow_max_um_per_s: float) -> None:
-        self._most_um_per_s = flow_max_um_per_s + _SATURATED_UM_PER_S
+    def __init__(self, run: Run) -> None:
+        self._since_s, self._most_um_per_s = _flow_limits(run)
         self._fraction = summary.Moments()
         self._travel = 0.0
         self._starts = self._running = self._saturated = 0
@@ -280,8 +280,9 @@ class _PumpSums:
         self._travel += float(np.abs(np.diff(pump)).sum())
         self._starts += int((running[1:] & ~running[:-1]).sum())
         self._running += int(running.sum())
-        wanted = held["flow_wanted_um_per_s"]
-        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > self._most_um_per_s)).sum())
+        wanted, since = held["flow_wanted_um_per_s"], np.searchsorted(self._since_s, held["mono_s"], "right")
+        most = self._most_um_per_s[since - 1] + _SATURATED_UM_PER_S
+        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > most)).sum())
 
     def result(self, period_s: float) -> PumpActivity:
         count = self._fraction.count
@@ -296,3 +297,15 @@ class _PumpSums:
             running_share=self._running * share,
             saturated_share=self._saturated * share,
         )
+
+
+def _flow_limits(run: Run) -> tuple[Column, Column]:
+    """Times from which a largest flow was in force, and those flows: they change with a curve of the pump."""
+    found = [(-math.inf, run.config)]
+    status = RunStatus()
+    for each in run.log:
+        before, status = status.loop, status.after_event(each.event, each.mono_s)
+        if status.loop is not before:
+            found.append((each.mono_s, run.config.with_gains(status.loop)))
+    since_s, most = np.array([(at_s, config.loop.flow_most_um_per_s(config.pump)) for at_s, config in found]).T
+    return since_s, most
