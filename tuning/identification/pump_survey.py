@@ -24,10 +24,12 @@ _BENT_SHARE = 0.035  # of the full flow, by which a kink between two levels may 
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _NONE_SHARE, _JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
 _EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.1, 0.04  # commands between which a jump lies, at worst; levels for a bend
+_STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
+_CAUGHT = 0.75  # of the limit; the rest is for gusts and noise
 _NONE_UM_PER_S = 1e-3  # at command 0
 _PULSE_S, _LONGEST_S = 0.2, 20.0
 _MOST_VISITS = 6
@@ -260,8 +262,11 @@ class PumpSurvey:
         if self._net(level) > 0:
             bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
             above = [] if level.rising else [_for(self._higher(level), 0.1)]
-            down = _for(0.0, 60.0, min(bottom_um + leak * (self.fit.delay_s + self.fit.lag_s), 0.0))
-            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, _for(0.0, max(0.3, self.fit.answer_s))]
+            late_um = leak * (self.fit.delay_s + self.fit.lag_s)  # by which it sinks before a command shows
+            down = _for(0.0, 60.0, min(bottom_um + late_um, 0.0))
+            # a short run lifts it less than the leak takes meanwhile: the hold must catch it within the limit
+            rest = _for(0.0, max(0.3, self.fit.answer_s), min(late_um - _CAUGHT * self.limit_um, 0.0))
+            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, rest]
         top_um = max(0.5 * travel_um - self._net(Level(up)) * self.fit.answer_s, -0.2 * travel_um)
         rest = [_for(0.0, 0.3)] if level.rising else []
         return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, 60.0, top_um), *rest, run]
@@ -379,6 +384,8 @@ class PumpSurvey:
         while top + 1 < known.size and known[top + 1]:
             top += 1
         beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
+        if beyond:
+            self._refuse_step()
         if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
             raise ValueError(
                 f"the flow {'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f} is "
@@ -387,6 +394,19 @@ class PumpSurvey:
             )
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
+
+    def _refuse_step(self) -> None:
+        """Raises ValueError if the flow rises at once from less than the leak to several times as much."""
+        fractions, flows, sigmas = self._branches[True].columns
+        leak = self.fit.leak_um_per_s
+        above = int(np.argmax(flows - 2 * sigmas > _STEP_LEAKS * leak))
+        below = above - 1
+        if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
+            raise ValueError(
+                f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
+                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: no command "
+                "holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
+            )
 
 
 def _jump(branch: Branch, full: float) -> tuple[float, float] | None:
