@@ -21,8 +21,8 @@ from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreig
 from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
-from tuning.identification.pump_curve import Level, PumpRun, fit
-from tuning.identification.pump_survey import PumpMap
+from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit
+from tuning.identification.pump_survey import PumpMap, PumpSurvey
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig
 
@@ -158,6 +158,36 @@ def test_a_stuck_pump_is_told(
     for _ in range(240):
         link.news()
     assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])  # with the former gains and curve
+
+
+def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: float = 0.1) -> PumpSurvey:
+    """A survey that has found these flows at these commands, to 1 % and 0.05 um/s."""
+    found = PumpSurvey(0.15)
+    sigmas = [0.01 * flow + 0.05 for flow in flows]
+    levels = {Level(f): FlowAt(*at) for f, *at in zip(fractions, flows, sigmas, strict=True)}
+    found.fit = PumpFit(levels, np.diag(np.square(sigmas)), leak, delay_s, 0.1, 0.9)
+    columns = ([0.0, *fractions], [0.0, *flows], [0.001, *sigmas])
+    branch = Branch(*(np.array(column) for column in columns))
+    found._branches = {True: branch, False: Branch(*np.zeros((3, 1)))}
+    return found
+
+
+def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
+    said = "rises from 0.1 um/s at a command of 0.25 to 17.0 um/s at 0.35, and the mirror loses 1.8 um/s"
+    with pytest.raises(ValueError, match=said):
+        survey_of([0.25, 0.35], [0.1, 17.0], 1.8)._known_part()
+    with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # what is between may hold it
+        survey_of([0.25, 0.55], [0.1, 17.0], 1.8)._known_part()
+    with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # a hold at 4.5 is possible
+        survey_of([0.25, 0.35], [0.1, 17.0], 4.5)._known_part()
+
+
+@pytest.mark.parametrize(("leak", "delay_s", "least_um"), [(2.4, 1.9, -2.7), (0.5, 0.1, -7.4), (6.0, 1.9, 0.0)])
+def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(leak: float, delay_s: float, least_um: float) -> None:
+    survey = survey_of([0.3, 0.6], [leak - 0.2, leak + 0.2], leak, delay_s)
+    *_, run, rest = survey._visit(Level(0.6))
+    assert (run.fraction, rest.fraction) == (0.6, 0.0)
+    assert rest.until_um == pytest.approx(least_um)
 
 
 def flat_map(pump: PumpConfig) -> PumpMap:

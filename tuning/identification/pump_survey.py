@@ -404,8 +404,8 @@ class PumpSurvey:
         if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
             raise ValueError(
                 f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
-                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: no command "
-                "holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
+                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: "
+                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
             )
 
 
