@@ -405,7 +405,8 @@ class PumpSurvey:
             raise ValueError(
                 f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
                 f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: "
-                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
+                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run "
+                "`tune pump` again"
             )
 
 
