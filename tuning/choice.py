@@ -101,7 +101,8 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     """
     folder, shape_s = _named(name, logs)
     config = toml_file.load(path, schema.Config)
-    gains, pump, keys = config.loop, config.pump, GAIN_KEYS
+    keys: tuple[str, ...] = GAIN_KEYS
+    gains, pump = config.loop, config.pump
     if shape_s is None or folder.done("verify") or pump_trial.mapped(folder):
         gains, pump = _kept(folder), folder.config.pump
         same = config

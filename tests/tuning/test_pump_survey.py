@@ -161,9 +161,9 @@ def test_a_stuck_pump_is_told(
 
 
 def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: float = 0.1) -> PumpSurvey:
-    """A survey that has found these flows at these commands, to 1 % and 0.05 um/s."""
-    found = PumpSurvey(0.15)
-    sigmas = [0.01 * flow + 0.05 for flow in flows]
+    """A survey that has found these flows at these commands, to 3 % and 0.05 um/s."""
+    found = PumpSurvey(0.15, runs=[PumpRun(DT_S, *np.zeros((3, 1)))])
+    sigmas = [0.03 * flow + 0.05 for flow in flows]
     levels = {Level(f): FlowAt(*at) for f, *at in zip(fractions, flows, sigmas, strict=True)}
     found.fit = PumpFit(levels, np.diag(np.square(sigmas)), leak, delay_s, 0.1, 0.9)
     columns = ([0.0, *fractions], [0.0, *flows], [0.001, *sigmas])

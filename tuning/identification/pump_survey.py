@@ -265,8 +265,8 @@ class PumpSurvey:
             late_um = leak * (self.fit.delay_s + self.fit.lag_s)  # by which it sinks before a command shows
             down = _for(0.0, 60.0, min(bottom_um + late_um, 0.0))
             # a short run lifts it less than the leak takes meanwhile: the hold must catch it within the limit
-            rest = _for(0.0, max(0.3, self.fit.answer_s), min(late_um - _CAUGHT * self.limit_um, 0.0))
-            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, rest]
+            wait = _for(0.0, max(0.3, self.fit.answer_s), min(late_um - _CAUGHT * self.limit_um, 0.0))
+            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, wait]
         top_um = max(0.5 * travel_um - self._net(Level(up)) * self.fit.answer_s, -0.2 * travel_um)
         rest = [_for(0.0, 0.3)] if level.rising else []
         return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, 60.0, top_um), *rest, run]
