@@ -1,8 +1,8 @@
 """A hold with its page, fifty viewers and one that has stopped reading: do its ticks notice?
 
 Phases without and with viewers alternate in one hold; the page runs in all of them. A viewer speaks socket.io as a
-browser does and fetches the charts and maps that it is told to. `python -m benchmarks.viewers LINK COUNT` is such viewers,
-until its standard input ends.
+browser does and fetches the charts and maps that it is told to. `python -m benchmarks.viewers LINK COUNT` is such
+viewers, until its standard input ends.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -81,8 +82,7 @@ class Viewer:
 
     def judged(self) -> tuple[float, str]:
         """The longest time without an update, s, and what went wrong."""
-        told_s = [*self.told_s, time.monotonic()]
-        gap_s = max((b - a for a, b in zip(told_s, told_s[1:], strict=False)), default=1e9)
+        gap_s = max(b - a for a, b in pairwise([*self.told_s, time.monotonic()]))
         return gap_s, self.failed or ("" if self.socket.connected else "was hung up on")
 
 

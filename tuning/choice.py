@@ -44,7 +44,7 @@ def chosen(folder: SessionFolder, rig: HoldRig, yes: bool, name: str, progress: 
     if name:
         session.choose(folder, name)
     while not (name or yes):
-        answer = progress.ask("apply which candidate? (Enter: none)")
+        answer = progress.ask("apply which candidate? (Enter: none)", session.choices(folder))
         if not answer:
             return False
         try:

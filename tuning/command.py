@@ -160,7 +160,7 @@ def _to_be_tried(unfit: str, after_s: float, before_s: float, options: TuneOptio
         progress.say(f"the present time constant, {before_s:.0f} s, fits")
         return False
     asked = not options.yes and sys.stdin.isatty()
-    answer = progress.ask(f"try it instead of {before_s:.0f} s? [y/N]") if asked else ""
+    answer = progress.ask(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",)) if asked else ""
     return options.yes or answer.lower() in ("y", "yes")
 
 

@@ -202,6 +202,13 @@ def offered(session: folder.SessionFolder) -> tuple[tuple[design.Candidate, ...]
     return (*rows, edited), edited
 
 
+def choices(session: folder.SessionFolder) -> tuple[str, ...]:
+    """Names of the candidates that may be applied, the proposed one first."""
+    rows, now = offered(session)
+    ordered = sorted(rows, key=lambda row: row is not now)
+    return tuple(row.name for row in ordered if row.name != design.PRESENT and not trade.refusal(row))
+
+
 def choose(session: folder.SessionFolder, name: str) -> None:
     """Put a candidate into `gains.toml`. Raises InputError if it is unknown or must not be applied."""
     rows, now = offered(session)

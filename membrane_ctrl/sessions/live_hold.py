@@ -2,11 +2,12 @@
 
 import contextlib
 import math
+import select
 import signal
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -214,7 +215,7 @@ class Progress:
         self._print(line)
         self.note("said", line)
 
-    def note(self, what: str, line: str, **more: float) -> None:
+    def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
         """Note in the log, if there is one."""
         if self.log is not None:
             self.log.note(what, line, **more)
@@ -222,12 +223,21 @@ class Progress:
     def _print(self, line: str) -> None:
         terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
 
-    def ask(self, question: str) -> str:
-        """Ask on the terminal; the answer is empty at the end of the input. Ctrl-C interrupts at once."""
+    def ask(self, question: str, among: Sequence[str] = ()) -> str:
+        """Ask on the terminal, and on the page too if the answers are `among` some; the first answer counts.
+
+        It is empty at the end of the input, and for none of them. Ctrl-C interrupts at once.
+        """
+        if self.log is not None:
+            self.log.answer("", ())  # one that came too late for the last question
         print(f"{question} ", end="", file=sys.stderr, flush=True)
-        self.note("asks", question)
+        self.note("asks", question, among=among)
         self._asking = True
         try:
+            while among and self.log is not None and not _typed(_POLL_S):
+                if (given := self.log.answer(question, among)) is not None:
+                    self.say(f"{given.by} answers on the page: {given.said or 'none'}")
+                    return given.said
             return sys.stdin.readline().strip()
         finally:
             self._asking = False
@@ -247,6 +257,14 @@ class Progress:
         finally:
             for number, handler in former.items():
                 signal.signal(number, handler)
+
+
+def _typed(within_s: float) -> bool:
+    """Whether a line waits on the terminal, or its end; also if it cannot tell."""
+    try:
+        return bool(select.select([sys.stdin], [], [], within_s)[0])
+    except (OSError, ValueError):  # not a file
+        return True
 
 
 def _clock(seconds: float) -> str:

@@ -1,26 +1,29 @@
 """`live.jsonl` of a session: what it does, what it has found, and the centre as it moves, for the page that shows it.
 
 One JSON object per line, appended as things happen, so that nothing is lost if the session is killed. A reader may
-follow the file while it grows; a torn or foreign line is skipped.
+follow the file while it grows; a torn or foreign line is skipped. `answer.json` beside it is what a viewer of the
+page answers to the question that waits.
 """
 
+import contextlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.model import errors, files, plain_json, telemetry
+from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
 from membrane_ctrl.sessions import folder
 
-NAME = "live.jsonl"
+NAME, ANSWER = "live.jsonl", "answer.json"
+_ANSWER_BYTES_MAX = 4000
 EVERY_S = 0.2  # one point of the picture; a relay's half cycle takes seconds
 _POINTS = 5  # of a line
 _COLUMNS = ("displacement_um", "setpoint_um", "flow_um_per_s")
 _BYTES_MAX = 8_000_000  # a session of an hour takes half a megabyte
 _POINTS_MAX = 100_000
-_LINES_MAX, _LINE_MAX = 200, 500  # what a page can show
+_LINES_MAX, _LINE_MAX, _ANSWERS_MAX = 200, 500, 20  # what a page can show
 
 
 class LiveLog:
@@ -51,10 +54,26 @@ class LiveLog:
             points = {name: [_mean([getattr(row, name) for row in group]) for group in groups] for name in _COLUMNS}
             self._append({"every_s": self._every_s, **points})
 
-    def note(self, what: str, line: str, **more: float) -> None:
-        """Note what happens: `step` (its name, `planned_s`, `after_s`), `said`, `asks`, or `ended` (why)."""
+    def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
+        """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or `ended` (why)."""
         self.flush()
         self._append({what: line, "utc": folder.now_utc(), **more})
+
+    def answer(self, question: str, among: Sequence[str]) -> "Answer | None":
+        """Take the answer to a question from the page; None if there is none, or it is to another, or not `among`."""
+        path = self._path.with_name(ANSWER)
+        try:
+            text = files.read_text(path, _ANSWER_BYTES_MAX, "replace")
+        except OSError:
+            return None
+        with contextlib.suppress(OSError):
+            path.unlink()
+        try:
+            given = plain_json.loads(text)
+            fits = given["to"] == question and given["said"] in ("", *among)
+            return Answer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
+        except (ValueError, TypeError, KeyError):
+            return None
 
     def _append(self, entry: dict[str, Any]) -> None:
         if not self._good:
@@ -65,6 +84,20 @@ class LiveLog:
         except OSError as error:
             self._good = False
             self._told(f"{self._path}: {errors.os_reason(error)}; the page does not show the rest of this session")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a viewer of the page answered; empty: none of those that were named."""
+
+    said: str
+    by: str
+
+
+def give_answer(session: Path, question: str, given: Answer) -> None:
+    """Leave the answer to a question where the session finds it. Raises OSError."""
+    text = json.dumps({"to": question, "said": given.said, "by": given.by})
+    files.write_text_atomic(files.users(session / ANSWER), text + "\n")
 
 
 def _mean(values: list[float]) -> float | None:
@@ -84,6 +117,7 @@ class Progressed:
     ended: str = ""  # why the session ended; empty while it runs, or if it was killed
     said: tuple[str, ...] = ()  # results, oldest first
     begun_s: tuple[tuple[float, str], ...] = ()  # where on the picture each step began
+    among: tuple[str, ...] = ()  # answers to the question that the page may give
 
 
 @dataclass(slots=True)
@@ -129,11 +163,12 @@ class LiveReader:
             begun = (*now.begun_s, (self.time_s, _line(entry["step"])))[-_LINES_MAX:]
             self.progress = Progressed(begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun)
         elif "said" in entry:
-            self.progress = replace(now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="")
+            self.progress = replace(now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="", among=())
         elif "asks" in entry:
-            self.progress = replace(now, asks=_line(entry["asks"]))
+            among = tuple(_line(name) for name in entry.get("among", ())[:_ANSWERS_MAX])
+            self.progress = replace(now, asks=_line(entry["asks"]), among=among)
         else:
-            self.progress = replace(now, ended=_line(entry["ended"]), asks="")
+            self.progress = replace(now, ended=_line(entry["ended"]), asks="", among=())
 
     def _draw(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         every_s = float(entry["every_s"])

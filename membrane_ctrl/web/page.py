@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import gzip
+import json
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -10,9 +12,9 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
-from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed
-from membrane_ctrl.web.panels import SharedViews, alarms_of, fleet_panel, fresh, runs_panel, tuning_panel
+from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
+from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
+from membrane_ctrl.web.panels import CHOOSES, SessionWatch, TuningPanel, alarms_of, fleet_panel, fresh, runs_panel
 
 _LOOK_S = 1.0
 _FETCH_S = 30.0  # for a browser to fetch a chart
@@ -25,6 +27,32 @@ _FIGURES = (
     ("missed ticks", "missed_ticks", "", 0),
 )  # fmt: skip
 _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
+
+
+class SharedViews:
+    """What all viewers of a hold see alike, made once: charts, maps, the tuning session.
+
+    Browsers fetch charts and maps when they are ready, so that none pile up for a slow one.
+    """
+
+    def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
+        self._feeds = feeds
+        self.charts = figures.Shared(self._chart, life_s=_LOOK_S)
+        self.maps = figures.Shared(self._map, life_s=60.0)
+        watches = {name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None}
+        self.sessions = figures.Shared(lambda hold: watches[hold].look(), life_s=_LOOK_S)
+
+    def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
+        """Options of the history chart, as JSON in gzip."""
+        feed, span_s = self._feeds[hold], SPANS_S[span]
+        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, span_s)
+        return gzip.compress(json.dumps(options).encode(), 1)
+
+    def _map(self, hold: str, removed: str, _time_s: float) -> figures.MapPicture:
+        """The newest figure less some terms; a figure of another time is another map."""
+        seen = self._feeds[hold].seen
+        assert seen.figure is not None
+        return figures.map_picture(seen.figure, seen.reference, figures.REMOVED[removed])
 
 
 class WebPage:
@@ -70,10 +98,13 @@ class WebPage:
                     load = runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
                     tabs.on_value_change(lambda event: load() if event.value == look_back.props["name"] else None)
                 with ui.tab_panel(tune):
-                    tuning_panel(lambda: self._views.sessions.get(self._hold))
+                    TuningPanel(lambda: self._views.sessions.get(self._hold), self._user, self._may_choose)
         ui.keyboard(on_key=self._key)
         ui.timer(_LOOK_S, self._look)
         ui.timer(_LOOK_S, self._draw)
+
+    def _may_choose(self) -> bool:
+        return outranks(self._user.role, CHOOSES) and outranks(self._feed.seen.role, CHOOSES)
 
     def _build_now(self) -> None:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')

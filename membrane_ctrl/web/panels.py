@@ -1,12 +1,12 @@
 """Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""
 
 import asyncio
-import gzip
-import json
 import math
 import subprocess
 import sys
+import time
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,19 +15,22 @@ from urllib.parse import quote
 
 from nicegui import ui
 
+from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
-from membrane_ctrl.sessions.live_log import LiveReader, Progressed
+from membrane_ctrl.sessions.live_log import ANSWER, Answer, LiveReader, Progressed, give_answer
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import WebUser, outranks
-from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history
+from membrane_ctrl.web.feed import HoldFeed
 
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
 _LOOK_S = 1.0
+_TAKES = 5  # looks until a session that asks has taken an answer
+CHOOSES: Role = "tune"  # as for `ctl gains`
 
 
 def alarms_of(status: Mapping[str, Any]) -> str:
@@ -187,16 +190,17 @@ def _command(*arguments: str) -> str:
 class SessionSeen:
     """The newest tuning session at one moment."""
 
-    name: str
+    path: Path
     done: frozenset[str]  # its steps
     progress: Progressed
+    candidates: tuple[tuple[str, ...], ...] = ()  # their table, its head first, while the session waits for a choice
 
     @property
     def head(self) -> str:
         """Where it is, in a line."""
         step, asks, ended = self.progress.step, self.progress.asks, self.progress.ended
-        words = (step or "begun", asks and f"asks on its terminal: {asks}", ended and f"ended: {ended}")
-        return f"{self.name}: {', '.join(filter(None, words))}"
+        words = (step or "begun", asks and f"asks: {asks}", ended and f"ended: {ended}")
+        return f"{self.path.name}: {', '.join(filter(None, words))}"
 
 
 class SessionWatch:
@@ -216,33 +220,33 @@ class SessionWatch:
             self._reader = LiveReader(newest.path)
         self._reader.read()
         done = frozenset(step for step in folders.STEPS if newest.done(step))
-        return SessionSeen(newest.path.name, done, self._reader.progress)
+        progress, table = self._reader.progress, ()
+        if progress.among:
+            with suppress(errors.InputError):
+                table = _table(newest.candidates())
+        return SessionSeen(newest.path, done, progress, table)
 
 
-class SharedViews:
-    """What all viewers of a hold see alike, made once: charts, maps, the tuning session.
+def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
+    """The cells of a Markdown table, without its rule."""
+    head, _, *rows = (tuple(map(str.strip, line.strip("| ").split("|"))) for line in markdown.splitlines())
+    return head, *(row for row in rows if len(row) == len(head))
 
-    Browsers fetch charts and maps when they are ready, so that none pile up for a slow one.
-    """
 
-    def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
-        self._feeds = feeds
-        self.charts = figures.Shared(self._chart, life_s=1.0)
-        self.maps = figures.Shared(self._map, life_s=60.0)
-        watches = {name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None}
-        self.sessions = figures.Shared(lambda hold: watches[hold].look(), life_s=_LOOK_S)
-
-    def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
-        """Options of the history chart, as JSON in gzip."""
-        feed, span_s = self._feeds[hold], SPANS_S[span]
-        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, span_s)
-        return gzip.compress(json.dumps(options).encode(), 1)
-
-    def _map(self, hold: str, removed: str, _time_s: float) -> figures.MapPicture:
-        """The newest figure less some terms; a figure of another time is another map."""
-        seen = self._feeds[hold].seen
-        assert seen.figure is not None
-        return figures.map_picture(seen.figure, seen.reference, figures.REMOVED[removed])
+def answered(session: Path, question: str, given: Answer) -> str:
+    """Give a session an answer; returns what became of it, in one line."""
+    what = given.said or "none of them"
+    try:
+        give_answer(session, question, given)
+    except OSError as error:
+        return f"{what}: not given: {errors.os_reason(error)}"
+    for _ in range(_TAKES):
+        if not (session / ANSWER).exists():
+            return f"{what}: done"
+        time.sleep(_LOOK_S)
+    with suppress(OSError):
+        (session / ANSWER).unlink()
+    return f"{what}: not taken: the session no longer asks; see its terminal"
 
 
 def fresh(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:
@@ -250,30 +254,81 @@ def fresh(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:
     return next(new[len(old) - gone :] for gone in range(len(old) + 1) if old[gone:] == new[: len(old) - gone])
 
 
-def tuning_panel(look: Callable[[], Awaitable[SessionSeen | None]]) -> None:
-    """Fill the tab."""
-    head = ui.label("No tuning session in this folder.").classes("text-subtitle1")
-    steps = ui.row()
-    said = ui.log(max_lines=200).classes("w-full h-64")
-    shown: SessionSeen | None = None
+class TuningPanel:
+    """The tab of the tuning session: its steps, what it has found, and the choice it waits for.
 
-    async def show() -> None:
-        nonlocal shown
-        seen, before = await look(), shown
+    `look` returns the session now, `may` whether the viewer may choose.
+    """
+
+    def __init__(
+        self, look: Callable[[], Awaitable[SessionSeen | None]], user: WebUser, may: Callable[[], bool]
+    ) -> None:
+        self._look, self._user, self._may = look, user, may
+        self._head = ui.label("No tuning session in this folder.").classes("text-subtitle1").props('role="status"')
+        self._steps = ui.row()
+        self._choice = ui.column().classes("w-full")
+        self._said = ui.log(max_lines=200).classes("w-full h-64").props('aria-label="results"')
+        self._buttons: list[ui.button] = []
+        self._seen: SessionSeen | None = None
+        ui.timer(_LOOK_S, self._show)
+
+    async def _show(self) -> None:
+        seen, before = await self._look(), self._seen
+        for button in self._buttons:
+            if button.enabled != self._may():
+                button.set_enabled(self._may())
         if seen is None or seen == before:
             return
-        shown = seen
-        head.set_text(seen.head)
-        if before is None or before.name != seen.name:
-            said.clear()
-            before = None
-        for line in fresh(before.progress.said if before else (), seen.progress.said):
-            said.push(line)
-        if before is None or (before.done, before.progress.step) != (seen.done, seen.progress.step):
-            steps.clear()
-            with steps:
-                for step in folders.STEPS:
-                    colour = "positive" if step in seen.done else "info" if step == seen.progress.step else "grey"
-                    ui.badge(step, color=colour)
+        self._seen = seen
+        self._head.set_text(seen.head)
+        if before is None or before.path != seen.path:
+            self._said.clear()
+            before = SessionSeen(seen.path, frozenset(), Progressed())
+            self._show_steps(seen)
+        for line in fresh(before.progress.said, seen.progress.said):
+            self._said.push(line)
+        if (before.done, before.progress.step) != (seen.done, seen.progress.step):
+            self._show_steps(seen)
+        if (before.progress.asks, before.progress.among) != (seen.progress.asks, seen.progress.among):
+            self._show_choice(seen)
 
-    ui.timer(_LOOK_S, show)
+    def _show_steps(self, seen: SessionSeen) -> None:
+        self._steps.clear()
+        with self._steps:
+            for step in folders.STEPS:
+                colour = "positive" if step in seen.done else "info" if step == seen.progress.step else "grey"
+                ui.badge(step, color=colour)
+
+    def _show_choice(self, seen: SessionSeen) -> None:
+        self._choice.clear()
+        self._buttons.clear()
+        if not seen.progress.among:
+            return
+        with self._choice:
+            ui.label(f"The session waits, here and on its terminal: {seen.progress.asks}").classes("text-bold")
+            if seen.candidates:
+                head, *rows = seen.candidates
+                columns = [{"name": name, "label": name, "field": name, "align": "left"} for name in head]
+                cells = [dict(zip(head, row, strict=True)) for row in rows]
+                ui.table(columns=columns, rows=cells, row_key=head[0]).classes("w-full").props("dense")
+            with ui.row():
+                for name in (*seen.progress.among, ""):
+                    button = ui.button(name or "none", on_click=lambda _, said=name: self._answer(seen, said))
+                    button.props("no-caps" if name else "no-caps flat").tooltip(f"needs the role {CHOOSES}")
+                    button.set_enabled(self._may())
+                    self._buttons.append(button)
+
+    async def _answer(self, seen: SessionSeen, said: str) -> None:
+        """Ask for a confirmation, answer, and say what became of it."""
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"{seen.progress.asks} {said or 'none'}").classes("text-h6")
+            with ui.row():
+                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
+                ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
+        sure = await dialog
+        dialog.delete()
+        if not sure or not self._may():
+            return
+        given = Answer(said, self._user.name)
+        outcome = await asyncio.to_thread(answered, seen.path, seen.progress.asks, given)
+        ui.notify(outcome, type="positive" if outcome.endswith(": done") else "negative", timeout=8000)

@@ -16,8 +16,8 @@ from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, HoldFeed
 from membrane_ctrl.web.figures import REMOVED
-from membrane_ctrl.web.page import WebPage
-from membrane_ctrl.web.panels import REPORT, SharedViews, run_folder
+from membrane_ctrl.web.page import SharedViews, WebPage
+from membrane_ctrl.web.panels import REPORT, run_folder
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 _AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,8 +15,9 @@ import pytest
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions import folder
-from membrane_ctrl.sessions.live_log import NAME, LiveLog, LiveReader, Progressed
+from membrane_ctrl.sessions import folder, live_hold
+from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.live_log import ANSWER, NAME, Answer, LiveLog, LiveReader, Progressed, give_answer
 from tuning import choice
 from tuning.explore.live_page import LivePage, status
 
@@ -150,3 +155,83 @@ def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
         return
     with pytest.raises(InputError, match=refused):
         choice.for_hold(opened, link)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Where a person types; the program's standard input is the terminal."""
+    monkeypatch.setattr(live_hold, "_POLL_S", 0.01)
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        yield ours
+    os.close(ours)
+
+
+class AskedPage(LiveLog):
+    """A log whose question is answered on the page, or at the keyboard, as soon as it is asked."""
+
+    def __init__(self, session: Path, *answers: str, keyboard: int = -1, typed: str = "") -> None:
+        super().__init__(session, RATE_HZ, lambda line: pytest.fail(line))
+        self._session, self._answers, self._keyboard, self._typed = session, iter(answers), keyboard, typed
+
+    def note(self, what: str, line: str, **more: object) -> None:
+        super().note(what, line, **more)  # type: ignore[arg-type]
+        if what == "asks":
+            if self._typed:
+                os.write(self._keyboard, self._typed.encode())
+            for text in self._answers:
+                (self._session / ANSWER).write_text(text)
+                break
+
+
+def progress_of(log: LiveLog) -> Progress:
+    progress = Progress()
+    progress.log = log
+    return progress
+
+
+def answer(said: str, to: str = "which?", by: str = "anna") -> str:
+    return json.dumps({"to": to, "said": said, "by": by})
+
+
+@pytest.mark.parametrize("said", ["calm", ""])
+def test_a_question_is_answered_on_the_page(
+    tmp_path: Path, keyboard: int, capsys: pytest.CaptureFixture[str], said: str
+) -> None:
+    give_answer(tmp_path, "which?", Answer("lively", "bob"))  # to an earlier question: too late
+    log = AskedPage(tmp_path, answer(said, by="anna\x1b[2J"))
+    assert progress_of(log).ask("which?", ("lively", "calm")) == said
+    assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err
+    reader = LiveReader(tmp_path)
+    reader.read()
+    (line,) = reader.progress.said
+    assert line.startswith("anna")
+    assert "\x1b" not in line
+    assert (reader.progress.asks, reader.progress.among) == ("", ())
+    assert not (tmp_path / ANSWER).exists()
+
+
+@pytest.mark.parametrize(
+    "unfit",
+    [answer("wild"), answer("calm", to="another?"), "{", "[]", '{"to": "which?", "said": ["calm"], "by": 1}', "\0"],
+)
+def test_the_terminal_answers_as_ever_and_an_unfit_answer_of_the_page_does_not(
+    tmp_path: Path, keyboard: int, unfit: str
+) -> None:
+    log = AskedPage(tmp_path, unfit, keyboard=keyboard, typed="lively\n")
+    assert progress_of(log).ask("which?", ("lively", "calm")) == "lively"
+    assert log.answer("which?", ("lively", "calm")) is None
+    assert not (tmp_path / ANSWER).exists()
+
+
+def test_who_sees_the_question_sees_its_answers(tmp_path: Path) -> None:
+    log, reader = logged(tmp_path), LiveReader(tmp_path)
+    log.note("asks", "which?", among=("lively", "calm"))
+    reader.read()
+    assert (reader.progress.asks, reader.progress.among) == ("which?", ("lively", "calm"))
+    log.note("asks", "sure?")
+    reader.read()
+    assert (reader.progress.asks, reader.progress.among) == ("sure?", ())
+    (tmp_path / NAME).write_text('{"asks": "which?", "among": 5}\n')
+    LiveReader(tmp_path).read()

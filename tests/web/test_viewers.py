@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.sessions.folder import create_session
-from membrane_ctrl.sessions.live_log import LiveLog
+from membrane_ctrl.sessions.live_log import ANSWER, Answer, LiveLog
 from membrane_ctrl.web import panels, server
 from membrane_ctrl.web.access import WebUser
 from membrane_ctrl.web.figures import Shared
@@ -112,15 +112,33 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     assert seen is not None
     assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
     log.note("said", "line 300")
-    log.note("asks", "apply which?")
+    log.note("asks", "apply which?", among=("calm", "lively"))
+    (path / "candidates.md").write_text("| candidate | Ms |\n|---|---:|\n| calm | 1.3 |\n| torn\n| lively | 1.6 |\n")
     (path / "identified.json").write_text("{}")
     later = watch.look()
     assert later is not None
     assert panels.fresh(seen.progress.said, later.progress.said) == ("line 300",)
-    assert later.head == f"{path.name}: observe, asks on its terminal: apply which?"
+    assert later.head == f"{path.name}: observe, asks: apply which?"
     assert later.done == {"identify"}
+    assert later.candidates == (("candidate", "Ms"), ("calm", "1.3"), ("lively", "1.6"))
     log.note("ended", "stopped")
     second = create_session(tmp_path, "second", "eve", "twin", Config(), LoopConfig()).path
     newest = watch.look()
     assert newest is not None
     assert newest.head == f"{max(path, second).name}: " + ("begun" if second > path else "observe, ended: stopped")
+
+
+def test_an_answer_that_no_session_takes_is_withdrawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(panels.time, "sleep", slept.append)
+    given = Answer("calm", "anna")
+    assert (
+        panels.answered(tmp_path, "which?", given) == "calm: not taken: the session no longer asks; see its terminal"
+    )
+    assert not (tmp_path / ANSWER).exists()
+    log = LiveLog(tmp_path, 50.0, print)
+    taken: list[Answer | None] = []
+    monkeypatch.setattr(panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",))))
+    assert panels.answered(tmp_path, "which?", given) == "calm: done"
+    assert taken == [given]
+    assert panels.answered(tmp_path / "none", "which?", given).startswith("calm: not given: ")
