@@ -15,8 +15,12 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from membrane_ctrl.config.port import WebConfig
+from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.sessions.folder import create_session
+from membrane_ctrl.sessions.live_hold import Progress
+from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.web import cli, panels, server
 from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
@@ -91,6 +95,44 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         await tab.until("document.body.innerText.includes('onerror')")
         assert await tab.value("document.title") == "membrane_ctrl"
         await tab.screenshot(tmp_path / "page.png")
+
+
+CANDIDATES = """| candidate | K 1/s | std um | Ms | against present |
+|---|---:|---:|---:|---:|
+| present | 0.300 | 0.210 +- 0.010 | 1.35 | in force |
+| least-variance | 0.520 | 0.130 +- 0.008 | 1.58 | better: std x 0.62; worse: Ms x 1.17 |
+| simc-slow | 0.410 | 0.160 +- 0.009 | 1.42 | better: std x 0.76; worse: Ms x 1.05 |
+"""
+PRESS = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.toUpperCase().includes('{}')).click()"
+
+
+@needs_browser
+@pytest.mark.real_time
+@pytest.mark.campaign
+async def test_a_candidate_is_chosen_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = create_session(tmp_path, "night", "eve", "the-run", Config(), LoopConfig()).path
+    (path / "candidates.md").write_text(CANDIDATES)
+    progress = Progress()
+    progress.log = LiveLog(path, 50.0, print)
+    progress.note("step", "design", planned_s=0.0, after_s=600.0)
+    progress.say("design: K 0.520 1/s, Ti 2.10 s: std 0.210 -> 0.130 um")
+    keyboard, terminal = os.openpty()  # nobody types
+    with os.fdopen(keyboard), os.fdopen(terminal) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        async with viewed(tmp_path) as (_, tab):
+            names = ("least-variance", "simc-slow")
+            asking = asyncio.create_task(asyncio.to_thread(progress.ask, "apply which candidate?", names))
+            await tab.value(PRESS.format("TUNE"))
+            await tab.until("document.body.innerText.includes('0.160 +- 0.009')")
+            await tab.screenshot(tmp_path / "choice.png")
+            await tab.click("simc-slow")
+            await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+            assert not asking.done(), "nothing is chosen before the confirmation"
+            await tab.click("Do it")
+            assert await asking == "simc-slow"
+            await tab.until("document.body.innerText.includes('simc-slow: done')")
+            await tab.until("document.body.innerText.includes('link answers on the page: simc-slow')")
+            await tab.until("!document.body.innerText.includes('0.160 +- 0.009')")
 
 
 def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
