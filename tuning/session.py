@@ -206,7 +206,7 @@ def choices(session: folder.SessionFolder) -> tuple[str, ...]:
     """Names of the candidates that may be applied, the proposed one first."""
     rows, now = offered(session)
     ordered = sorted(rows, key=lambda row: row is not now)
-    return tuple(row.name for row in ordered if row.name != design.PRESENT and not trade.refusal(row))
+    return tuple(row.name for row in ordered if row.name != design.PRESENT and not design.refusal(row))
 
 
 def choose(session: folder.SessionFolder, name: str) -> None:

@@ -220,7 +220,8 @@ class SessionWatch:
             self._reader = LiveReader(newest.path)
         self._reader.read()
         done = frozenset(step for step in folders.STEPS if newest.done(step))
-        progress, table = self._reader.progress, ()
+        progress = self._reader.progress
+        table: tuple[tuple[str, ...], ...] = ()
         if progress.among:
             with suppress(errors.InputError):
                 table = _table(newest.candidates())
