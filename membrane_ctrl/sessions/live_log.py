@@ -59,7 +59,7 @@ class LiveLog:
         self.flush()
         self._append({what: line, "utc": folder.now_utc(), **more})
 
-    def answer(self, question: str, among: Sequence[str]) -> "Answer | None":
+    def answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
         """Take the answer to a question from the page; None if there is none, or it is to another, or not `among`."""
         path = self._path.with_name(ANSWER)
         try:
@@ -71,7 +71,7 @@ class LiveLog:
         try:
             given = plain_json.loads(text)
             fits = given["to"] == question and given["said"] in ("", *among)
-            return Answer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
+            return PageAnswer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
         except (ValueError, TypeError, KeyError):
             return None
 
@@ -87,14 +87,14 @@ class LiveLog:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PageAnswer:
     """What a viewer of the page answered; empty: none of those that were named."""
 
     said: str
     by: str
 
 
-def give_answer(session: Path, question: str, given: Answer) -> None:
+def give_answer(session: Path, question: str, given: PageAnswer) -> None:
     """Leave the answer to a question where the session finds it. Raises OSError."""
     text = json.dumps({"to": question, "said": given.said, "by": given.by})
     files.write_text_atomic(files.users(session / ANSWER), text + "\n")

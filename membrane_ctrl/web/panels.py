@@ -21,8 +21,7 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
-from membrane_ctrl.sessions.live_log import ANSWER, Answer, LiveReader, Progressed, give_answer
-from membrane_ctrl.web import figures
+from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
 from membrane_ctrl.web.access import WebUser, outranks
 from membrane_ctrl.web.feed import HoldFeed
 
@@ -234,7 +233,7 @@ def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
     return head, *(row for row in rows if len(row) == len(head))
 
 
-def answered(session: Path, question: str, given: Answer) -> str:
+def answered(session: Path, question: str, given: PageAnswer) -> str:
     """Give a session an answer; returns what became of it, in one line."""
     what = given.said or "none of them"
     try:
@@ -330,6 +329,6 @@ class TuningPanel:
         dialog.delete()
         if not sure or not self._may():
             return
-        given = Answer(said, self._user.name)
+        given = PageAnswer(said, self._user.name)
         outcome = await asyncio.to_thread(answered, seen.path, seen.progress.asks, given)
         ui.notify(outcome, type="positive" if outcome.endswith(": done") else "negative", timeout=8000)

@@ -17,7 +17,7 @@ from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder, live_hold
 from membrane_ctrl.sessions.live_hold import Progress
-from membrane_ctrl.sessions.live_log import ANSWER, NAME, Answer, LiveLog, LiveReader, Progressed, give_answer
+from membrane_ctrl.sessions.live_log import ANSWER, NAME, LiveLog, LiveReader, PageAnswer, Progressed, give_answer
 from tuning import choice
 from tuning.explore.live_page import LivePage, status
 
@@ -199,7 +199,7 @@ def answer(said: str, to: str = "which?", by: str = "anna") -> str:
 def test_a_question_is_answered_on_the_page(
     tmp_path: Path, keyboard: int, capsys: pytest.CaptureFixture[str], said: str
 ) -> None:
-    give_answer(tmp_path, "which?", Answer("lively", "bob"))  # to an earlier question: too late
+    give_answer(tmp_path, "which?", PageAnswer("lively", "bob"))  # to an earlier question: too late
     log = AskedPage(tmp_path, answer(said, by="anna\x1b[2J"))
     assert progress_of(log).ask("which?", ("lively", "calm")) == said
     assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err

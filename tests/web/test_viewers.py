@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.sessions.folder import create_session
-from membrane_ctrl.sessions.live_log import ANSWER, Answer, LiveLog
+from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
 from membrane_ctrl.web import panels, server
 from membrane_ctrl.web.access import WebUser
 from membrane_ctrl.web.figures import Shared
@@ -131,13 +131,13 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
 def test_an_answer_that_no_session_takes_is_withdrawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     slept: list[float] = []
     monkeypatch.setattr(panels.time, "sleep", slept.append)
-    given = Answer("calm", "anna")
+    given = PageAnswer("calm", "anna")
     assert (
         panels.answered(tmp_path, "which?", given) == "calm: not taken: the session no longer asks; see its terminal"
     )
     assert not (tmp_path / ANSWER).exists()
     log = LiveLog(tmp_path, 50.0, print)
-    taken: list[Answer | None] = []
+    taken: list[PageAnswer | None] = []
     monkeypatch.setattr(panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",))))
     assert panels.answered(tmp_path, "which?", given) == "calm: done"
     assert taken == [given]
