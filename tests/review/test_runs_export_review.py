@@ -28,6 +28,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import Filter, entries, moment_s, number, one_line, resolve, span, to_prune
+from membrane_ctrl.review.report import html
 from membrane_ctrl.review.report.json import pump_change, pump_history
 from membrane_ctrl.review.runs import export
 from membrane_ctrl.review.viewer import viewer
@@ -85,6 +86,11 @@ def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
     said = "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune pump`"
     assert pump_change(seen, 0.12) == said
     assert pump_change(seen, 0.25) == ""
+    page = html._history(seen, 0.12)
+    assert html._text(said) in page
+    assert "0.800 ± 0.030" in page
+    assert "<svg" in page
+    assert html._text(said) not in html._history(seen, 0.25)
     assert pump_change([], 0.12) == ""
 
 

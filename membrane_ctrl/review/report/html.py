@@ -199,7 +199,7 @@ def _history(history: Sequence[PumpSeen], change_max: float) -> str:
     ]
     said = pump_change(history, change_max)
     warning = f"<ul class='odd'><li><b>pump</b> {_text(said)}</li></ul>" if said else ""
-    table = _table(["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows)
+    table = html_table(["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows)
     return f"{warning}<figure>{figures.pump_history(history, change_max)}</figure>{table}"
 
 
