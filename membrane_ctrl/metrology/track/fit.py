@@ -35,6 +35,7 @@ _UNKNOWNS = PARAMETERS + 3 * TERMS
 _BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
 
 
+_STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
 _FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not
 
@@ -260,6 +261,20 @@ def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
     """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
     x, y = phase_rad + shifts_rad
     return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
+
+
+def steadied(places_mm: FloatArray, variance_mm2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the mirror was in each of N steps, (N, 36) parameters and their variance, from the steps' own fits.
+
+    Five unknowns of a bin reproduce five steps whatever is assumed of the mirror's motion between them: an error of
+    a step's place becomes an error of all later frames with its shifts. Fits of the steps that scatter as their
+    errors do say that the mirror stood still; the rest is its motion, parameter by parameter.
+    """
+    mean_mm, error_mm2 = places_mm.mean(axis=0), variance_mm2.mean(axis=0)
+    moved_mm = places_mm - mean_mm
+    scatter_mm2 = np.sum(moved_mm**2, axis=0) / (len(places_mm) - 1)
+    share = np.maximum(scatter_mm2 - error_mm2, 0.0) / np.maximum(scatter_mm2, 1e-30)
+    return mean_mm + share * moved_mm, np.maximum(share, _STILL) * variance_mm2
 
 
 def stepped(

@@ -12,7 +12,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
-from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, steadied, stepped
 from membrane_ctrl.metrology.track.guards import Finding, LostOrders, Squares, light_faults
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
@@ -31,7 +31,6 @@ _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air
 _LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
 _STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
-_STANDING_FRAMES = 20  # of each step, over which a held mirror's motion averages out
 _SIGMA_EVERY = 25  # frames: errors change slowly, and the covariance costs as much as five fits
 
 
@@ -65,6 +64,7 @@ class _Standing:
     def __init__(self, shifts_rad: tuple[float, float]) -> None:
         self.shifts_rad = shifts_rad
         self.count = 0
+        self.variance_mm2 = np.zeros(surface.PARAMETERS)  # of the mean parameters, once the step is over
         self._parameters: list[FloatArray] = []  # of the first frame, then of all
 
     def add(self, seen_adu: Singles, fit: FrameFit) -> None:
@@ -74,10 +74,12 @@ class _Standing:
             self.count = 0
         if not self.count:
             self._seen, self._light = np.zeros(seen_adu.size), np.zeros_like(fit.light)
+            self._left = np.zeros(seen_adu.size)
             self._parameters = [parameters]
         self.count += 1
         self._seen += seen_adu
         self._light += fit.light
+        self._left += fit.weights * fit.residual_adu
         self._parameters.append(parameters)
 
     def seen_adu(self) -> Singles:
@@ -85,10 +87,10 @@ class _Standing:
         return (self._seen / self.count).astype(np.float32)
 
     def fit(self, radius_mm: float) -> FrameFit:
-        """The mean solution, without residual."""
+        """The mean solution."""
         shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
-        none = np.zeros(0, np.float32)
-        return FrameFit(shape, self._light / self.count, none, none, True)
+        left = (self._left / self.count).astype(np.float32)
+        return FrameFit(shape, self._light / self.count, left, np.ones_like(left), True)
 
 
 class Tracker:
@@ -125,6 +127,7 @@ class Tracker:
         self._anchor_light = math.nan
         self._orders = LostOrders(self._fitter)
         self._knocked = ""
+        self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
         self._covariance_um2, self._covariance_age = np.full((36, 36), math.nan), 0
         self._sag_sigma_um = math.nan
         self._left, self._count = np.zeros(scene.index.size), 0
@@ -184,33 +187,31 @@ class Tracker:
         self._steps[-1].add(seen_adu, fit)
 
     def _take_steps(self, shifts_rad: tuple[float, float]) -> None:
-        """Renew the scene if the frames before this one were the last of five steps that separate the axes.
-
-        Five steps determine the five unknowns of a bin, whatever motion is assumed between them: what the fits of the
-        steps say of it is true only as far as the light is known. A held mirror changes its bowl alone, and over many
-        frames is still.
-        """
-        steps, radius_mm = self._steps, self._last.surface.radius_mm
-        if len(steps) < ENOUGH_STEPS or steps[-1].shifts_rad == shifts_rad:
+        """At the end of a step of the pattern, judge its mean; renew the scene after five that separate the axes."""
+        steps = self._steps
+        if not steps or steps[-1].shifts_rad == shifts_rad:
             return
+        radius_mm = self._last.surface.radius_mm
+        last, noise_adu = steps[-1].fit(radius_mm), self._noise_adu / math.sqrt(steps[-1].count)
+        errors_mm2 = np.diag(self._fitter.covariance_mm2(last, steps[-1].shifts_rad, noise_adu))
+        steps[-1].variance_mm2 = errors_mm2 + self._place_mm2(steps[-1].shifts_rad)
         shown = np.array([step.shifts_rad for step in steps])
+        if not separable(shown):
+            return
         fits = [step.fit(radius_mm) for step in steps]
-        parameters = np.array([fit.surface.parameters for fit in fits])
-        mean_mm = parameters.mean(axis=0)
-        bowl = surface.Surface.hencky_bowl(1.0, radius_mm).parameters
-        deeper_mm = np.array([fit.surface.sag_mm for fit in fits])
-        deeper_mm -= deeper_mm.mean()
-        if min(step.count for step in steps) >= _STANDING_FRAMES:
-            if np.max(np.abs(surface.height_probe() @ (parameters - mean_mm).T)) > _STANDING_MM:
-                return
-            deeper_mm[:] = 0.0
-        places = mean_mm + np.outer(deeper_mm, bowl)
+        places, place_mm2 = steadied(
+            np.array([fit.surface.parameters for fit in fits]), np.array([step.variance_mm2 for step in steps])
+        )
         fits = [
             replace(fit, surface=surface.Surface.from_parameters(place, radius_mm))
             for fit, place in zip(fits, places, strict=True)
         ]
-        if separable(shown):
-            self._renew(fits, np.stack([step.seen_adu() for step in steps]), shown)
+        self._places_mm2 = dict(zip((step.shifts_rad for step in steps), place_mm2, strict=True))
+        self._renew(fits, np.stack([step.seen_adu() for step in steps]), shown)
+
+    def _place_mm2(self, shifts_rad: tuple[float, float]) -> FloatArray:
+        """Variance (36,) of the place at which the steps saw the mirror with these shifts, common to their frames."""
+        return self._places_mm2.get(shifts_rad, np.zeros(surface.PARAMETERS))
 
     def follow(
         self, frame: Image, shifts_rad: tuple[float, float], time_s: float, displacement_um: float = math.nan
@@ -388,7 +389,7 @@ class Tracker:
 
     def _estimate_errors(self, fit: FrameFit, shifts_rad: tuple[float, float]) -> None:
         """Covariance of the coefficients and sigma of the sag, smoothed over the estimates."""
-        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu)
+        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu) + np.diag(self._place_mm2(shifts_rad))
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         covariance = 1e6 * to_coeffs @ found @ to_coeffs.T
         sag_sigma_um = 1e3 * math.sqrt(gradient @ found @ gradient)

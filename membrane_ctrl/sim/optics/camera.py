@@ -13,7 +13,16 @@ from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.shade import Light, cubic_weights, level_table, node_positions, normal_quantiles, shade
+from membrane_ctrl.sim.optics.shade import (
+    Light,
+    cubic_weights,
+    level_table,
+    node_positions,
+    noise_bank,
+    normal_quantiles,
+    shade,
+    shade_crossed,
+)
 from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
 
 # Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
@@ -76,36 +85,70 @@ class OpticsRenderer:
         `out` (as of `blank`) is filled and returned; otherwise a new array is made. Raises ValueError if the pattern
         is unknown or `out` has another shape or type.
         """
-        camera, config = self.optics.camera, self.optics.pattern
+        camera = self.optics.camera
         picture = self.blank() if out is None else out
         depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
         if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
             raise ValueError(
                 f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, {camera.width_px}) {depth}"
             )
-        table = level_table(pattern, config, self.light)
-        full = float(2**camera.bits - 1)
-        dark = self.light.dark_fraction * full
         self._pictures += 1
-        fixed = (
-            self._nodes(displacement_um),
-            self._weights,
-            2 if pattern.role == "crossed" else int(pattern.axis == "y"),
-            self.film.radius_mm,
-            config.periods * config.period_mm,
-            (table.values, table.cell_mm, table.smooth),
-            np.array(
-                [dark, gain * (self.light.white_fraction * full - dark), self.light.leak, full, self.light.gamma]
-            ),
-            self._loss,
-            (normal_quantiles(), camera.noise_adu, (self.seed << 32) + self._pictures),
-            picture,
-        )
+        paint = self._crossed(pattern, gain) if pattern.role == "crossed" else self._striped(pattern, gain)
+        nodes, seed = self._nodes(displacement_um), (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
-        other = _second_hand().submit(shade, *fixed, middle, camera.height_px)
-        shade(*fixed, 0, middle)
+        other = _second_hand().submit(paint, nodes, seed, picture, middle, camera.height_px)
+        paint(nodes, seed, picture, 0, middle)
         other.result()
         return picture
+
+    def _striped(self, pattern: Pattern, gain: float) -> Callable[..., None]:
+        """Shades rows of a picture of a pattern along one axis."""
+        config, noise_adu = self.optics.pattern, self.optics.camera.noise_adu
+        table = level_table(pattern, config, self.light)
+        dark, white, full = self._levels(gain)
+
+        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+            shade(
+                nodes,
+                self._weights,
+                int(pattern.axis == "y"),
+                self.film.radius_mm,
+                config.periods * config.period_mm,
+                (table.values, table.cell_mm, table.smooth),
+                np.array([dark, white, self.light.leak, full]),
+                self._loss,
+                (normal_quantiles(), noise_adu, seed),
+                picture,
+                start,
+                stop,
+            )
+
+        return paint
+
+    def _crossed(self, pattern: Pattern, gain: float) -> Callable[..., None]:
+        """Shades rows of a picture of crossed fringes."""
+        side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm
+        if pattern.index < 1:
+            raise ValueError(f"pattern {pattern.name!r}: crossed fringes need 1 or more periods")
+        first = (shift_rad / (2 * np.pi) - 0.5 for shift_rad in (pattern.shift_rad, pattern.shift_y_rad))
+        shape: tuple[float, ...] = pattern.index / side_mm, *first, side_mm / 2, self.film.radius_mm**2
+        dark, white, full = self._levels(gain)
+        scale: tuple[float, ...] = dark, white, self.light.leak, self.light.gamma, self.optics.camera.noise_adu, full
+        columns, rows = (loss.astype(np.float32) for loss in self._loss)
+        columns = np.pad(columns, (0, -columns.size % self._step)).reshape(-1, self._step).T
+        weights, loss = self._weights.T.astype(np.float32), (columns.copy(), rows)
+        shape, scale = (tuple(np.array(each, np.float32)) for each in (shape, scale))
+
+        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+            shade_crossed(nodes, weights, shape, scale, loss, (noise_bank(), seed), picture, start, stop)
+
+        return paint
+
+    def _levels(self, gain: float) -> tuple[float, float, float]:
+        """Counts without light, of a white screen above that, and full scale."""
+        full = float(2**self.optics.camera.bits - 1)
+        dark = self.light.dark_fraction * full
+        return dark, gain * (self.light.white_fraction * full - dark), full
 
     def trace_pixels(self, displacement_um: float) -> Trace:
         """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing interpolated."""

@@ -97,6 +97,10 @@ def test_interpolated_phases_stay_within_a_tenth_of_a_milliradian(film: FilmShap
         assert error.max() < 1e-4
 
 
+def replace_noise(optics: OpticsConfig) -> OpticsConfig:
+    return optics.model_copy(update={"camera": optics.camera.model_copy(update={"noise_adu": 0.0})})
+
+
 def test_a_fine_ripple_survives_the_interpolation() -> None:
     optics = OpticsConfig(camera=CameraConfig(width_px=1224, height_px=1024, pixel_um=6.9, bits=16, noise_adu=0.0))
     film = FilmShape(37.1, ripples=(Ripple(1.0, 50.0, 20.0),))
@@ -106,6 +110,37 @@ def test_a_fine_ripple_survives_the_interpolation() -> None:
     true = 2 * np.pi * (hits.s_x_mm + SIDE_MM / 2) / 49.82 - np.pi
     error = np.abs(_wrapped(_phases(renderer, "x", 0.0) - true))[on]
     assert error.max() < 1e-3
+
+
+@pytest.mark.parametrize(("gamma", "bits"), [(1.0, 8), (2.2, 8), (1.0, 16)])
+def test_crossed_fringes_are_what_traced_rays_see(film: FilmShape, gamma: float, bits: int) -> None:
+    width, height = 245, 205
+    camera = CameraConfig(width_px=width, height_px=height, pixel_um=34.5, bits=bits, noise_adu=0.0)
+    renderer = OpticsRenderer(OpticsConfig(camera=camera), film, Light(gamma=gamma))
+    picture = renderer.render(Pattern("crossed", "", 32, 0.7, shift_y_rad=1.9), 3.0, gain=0.9).astype(float)
+    hits = renderer.trace_pixels(3.0)
+    rate = 2 * np.pi * 32 / SIDE_MM
+    waves = np.cos(rate * hits.s_x_mm + 0.7 + 31 * np.pi) + np.cos(rate * hits.s_y_mm + 1.9 + 31 * np.pi)
+    shown = np.maximum(np.abs(hits.s_x_mm), np.abs(hits.s_y_mm)) < SIDE_MM / 2
+    light = 0.02 + 0.98 * np.where(shown, np.maximum(0.5 + waves / 4, 0) ** gamma, 0.0)
+    row, column = np.mgrid[:height, :width]
+    away = ((row - (height - 1) / 2) ** 2 + (column - (width - 1) / 2) ** 2).ravel()
+    full = 2**bits - 1
+    counts = 0.02 * full + 0.9 * 0.78 * full * light * (1 - 0.15 * away / away.max()) * hits.on_film(500.0)
+    sure = np.abs(np.hypot(hits.x_mm, hits.y_mm) - 500.0) > 1.0
+    assert np.abs(picture.ravel() - counts)[sure].max() < 0.51 + 2e-5 * full
+
+
+def test_noise_of_crossed_fringes_is_as_configured_and_new_in_each_row_and_picture(film: FilmShape) -> None:
+    optics = OpticsConfig(camera=CameraConfig(width_px=300, height_px=250, pixel_um=28.0, bits=16, noise_adu=40.0))
+    renderer = OpticsRenderer(optics, film)
+    pattern = Pattern("crossed", "", 32)
+    clean = OpticsRenderer(replace_noise(optics), film).render(pattern, 0.0).astype(float)
+    first, second = (renderer.render(pattern, 0.0) - clean for _ in range(2))
+    assert first.std() == pytest.approx(40.0, rel=0.01)
+    assert abs(first.mean()) < 1.0
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.02
+    assert abs(np.corrcoef(first[:-1].ravel(), first[1:].ravel())[0, 1]) < 0.02
 
 
 def test_a_film_that_moves_moves_the_fringes_by_half_a_period_a_millimetre(
