@@ -15,6 +15,7 @@ from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
 from membrane_ctrl.metrology.track.live import LiveTracker
+from membrane_ctrl.metrology.track.modes import Stethoscope
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
@@ -151,7 +152,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
-        drift = cycle.LiveDrift(geometry, config.shape.bin_px)
+        drift, heard = cycle.LiveDrift(geometry, config.shape.bin_px), Stethoscope()
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot
@@ -163,8 +164,9 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
         def publish(estimate: ShapeEstimate) -> None:
             shapes.put(pack_estimate(estimate))
-            if (notice := drift.after(estimate)) is not None:
-                remote.tell(notice)
+            for notice in (drift.after(estimate), *heard.after(estimate)):
+                if notice is not None:
+                    remote.tell(notice)
             if raw is not None:
                 raw.after(estimate)
 

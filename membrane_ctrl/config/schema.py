@@ -157,6 +157,8 @@ class TwinConfig(Section):
     """Poisson ratio of the film, in its pictures. Change it to try `film` and `calibrate`."""
     film_stiffness_n_per_m: Annotated[float, Field(ge=1, le=1e9)] = 2.05e5
     """Modulus times thickness of the film, for the pressure that `simulate` states. Change it to try `film`."""
+    drum_nm: Annotated[float, Field(ge=0, le=1e4)] = 0.0
+    """Amplitude of each vibration of the film, at 27, 48, 57 and 61 Hz, in its pictures. Change it to try `modes`."""
     geometry: GeometryConfig | None = None  # true camera and screen poses; none: those of [optics.geometry]
 
 

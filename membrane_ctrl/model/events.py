@@ -169,6 +169,7 @@ _SENTENCES = {
     "plausibility": "Laser and camera disagree ({seen}). Do: check the laser's mount, the camera and the screen",
     "agreement": "Laser and camera agree again[ ({seen})]",
     "maintenance": "Maintenance {name}: {message}",
+    "vibrations": "Vibrations of the mirror: {message}",
     "maintenance_over": "Maintenance {name} is over: {message}",
     "held_by": "The mirror is held by {sensors}[; jumped: {jumped}]",
     "pump": "The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop reckons with {correction:.3f}",

@@ -131,6 +131,14 @@ class Capture(Event, kind="capture"):
     failed: str | None = None
 
 
+class Vibrations(Event, kind="vibrations"):
+    """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it was not heard."""
+
+    frequency_hz: list[float | None]
+    amplitude_nm: list[float | None]  # RMS over the mirror
+    message: str
+
+
 class FramesLeftOut(Event, kind="raw_frames"):
     """Frames around a fault are not kept."""
 

@@ -174,7 +174,8 @@ def _shape(config: Config) -> rrb.Vertical:
     ]  # fmt: skip
     if config.shape.mode == "track":
         fall = "Z4 (top) to Z36, change since hold began; a column a second, now on the right"
-        rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH)))
+        heard = _plot("Vibrations heard in each minute, Hz", streams.VIBRATIONS.path)
+        rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard))
     if config.recording.thumbnails:
         names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
         names = ["crossed"] if config.shape.mode == "track" else names

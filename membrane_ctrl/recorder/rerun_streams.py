@@ -36,6 +36,12 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
         values = np.array([[event["scale"], event["correction"]] for _, event in of_pump])
         squares = np.array([[event["sigma"] ** 2, 0.0] for _, event in of_pump])
         recording.measurements(streams.PUMP.path, np.array([at_s for at_s, _ in of_pump]), values, squares)
+    for at_s, event in zip(time_s, events, strict=True):
+        if event.get("kind") == "vibrations":
+            heard = [math.nan if value is None else value for value in event["frequency_hz"]]
+            most = len(streams.VIBRATIONS.lines)
+            values = np.array([(heard + most * [math.nan])[:most]])
+            recording.scalars(streams.VIBRATIONS.path, np.array([at_s]), values)
 
 
 # Fewer rows for the viewer while nothing happens; every tick is in the other files (docs/recording.md).

@@ -103,7 +103,13 @@ class Recording:
         stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
         for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS):
             stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
-        for block in (streams.band(self._config.limits.band_um), streams.CHANGE, streams.SAG, streams.PUMP):
+        for block in (
+            streams.band(self._config.limits.band_um),
+            streams.CHANGE,
+            streams.SAG,
+            streams.PUMP,
+            streams.VIBRATIONS,
+        ):
             stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
         for block in streams.MARKS:  # the average of the lines in a pixel would be none
             stream.log(block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True)

@@ -171,6 +171,7 @@ LOW_ORDERS = {
 ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"Z{j} µm", GREY) for j in range(1, 37)))
 CHANGE = Stream("/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values()))
 PUMP = Stream("/pump/scale", (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)))
+VIBRATIONS = Stream("/shape/vibrations", tuple(Line("", f"mode {k} Hz", GREY) for k in range(1, 9)))
 SAG = Stream("/shape/sag_change", (Line("", "sag change ± 1σ µm", BLUE, 2.0), Line("", "laser change µm", ORANGE)))
 RESIDUAL = Stream("/shape/residual", (Line("", "slope residual µrad", BLUE),))
 QUALITY = Stream("/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line("", "saturated fraction", RED)))

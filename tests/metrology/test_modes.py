@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.track.modes import find_modes
+from membrane_ctrl.metrology.track import modes
+from membrane_ctrl.metrology.track.modes import Stethoscope, VibrationMode, find_modes
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
+from membrane_ctrl.model.run_events import Vibrations
 from tests.support.vibrating_mirror import watched
 
 
@@ -83,3 +86,47 @@ def test_a_damped_mode_has_the_error_of_its_width() -> None:
     near = [error for error in errors if abs(error) < 5]
     assert len(near) >= 36
     assert 0.7 < np.sqrt(np.mean(np.square(near))) < 1.6
+
+
+FRAMES = np.arange(0.0, 60.0, 0.05), np.zeros((1200, 36))
+SHAPES = np.eye(36)
+
+
+def heard(monkeypatch: pytest.MonkeyPatch, minutes: list[dict[int, float]]) -> list[list[Event]]:
+    """What a hold tells in minutes in which modes, by the number of their shape, are at these frequencies."""
+    listener = Stethoscope()
+    told: list[list[Event]] = []
+    for lines in minutes:
+        found = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in lines.items())
+        monkeypatch.setattr(modes, "find_modes", lambda *_, found=found: found)
+        told.append(listener.search(*FRAMES))
+    return told
+
+
+def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = heard(monkeypatch, [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}])
+    lines = [[event.frequency_hz for event in minute if isinstance(event, Vibrations)] for minute in told]
+    assert lines == [[], [[48.0]], [[None]], [[48.1, 27.0]], [[47.0, None]]]
+    assert told[2][0].to_dict()["message"] == "none"
+
+
+def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def told(minutes: list[dict[int, float]]) -> list[Event]:
+        found = (event for minute in heard(monkeypatch, minutes) for event in minute)
+        return [event for event in found if not isinstance(event, Vibrations)]
+
+    usual, lower, near = {3: 48.0, 7: 61.0}, {3: 47.4, 7: 61.0}, {3: 48.2, 7: 61.0}
+    assert told(10 * [usual] + 10 * [near]) == []
+    moved, *again = told(6 * [usual] + 2 * [lower] + 6 * [usual] + 6 * [lower] + 6 * [usual])
+    assert isinstance(moved, Maintenance)
+    assert moved.name == "film_tension"
+    assert "48.00 Hz moved by -1.2%: the film's tension by -2.5%" in moved.message
+    assert [type(event) for event in again] == [MaintenanceOver]
+
+
+@pytest.mark.campaign
+def test_a_listener_hears_what_is_planted() -> None:
+    time_s, coeffs_um, planted = watched(1, lines_hz=(48.0,))
+    (told,) = Stethoscope().search(time_s, coeffs_um)
+    assert isinstance(told, Vibrations)
+    assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)

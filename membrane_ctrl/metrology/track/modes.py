@@ -13,14 +13,16 @@ search goes on with what is left. T is also the logarithm of the likelihood (Bre
 curvature is the frequency's variance, and frequencies with a T nearly as large are named as equally possible.
 """
 
+from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
 
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 ComplexArray = NDArray[np.complex128]
 
@@ -36,6 +38,14 @@ _CHANCE = 1e-9  # of a false line in one search
 _ALIKE = 10.0  # difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
 _MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
 _APART_HZ = 0.3  # closer ones are one line
+_SAME = 0.004  # relative: two searches see one mode, whatever the shapes
+_FAR, _SIMILAR = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
+
+SEARCH_S = 60.0
+LEAST_RATE_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
+MOVED = 0.01  # relative: the film's tension has changed by 2 %
+MODES = 8  # that a hold follows
+_SEARCHES = 5  # whose median is a mode's frequency
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,11 @@ class VibrationMode:
     evidence: float  # T less that of noise
     # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
     aliases_hz: tuple[float, ...] = ()
+
+    def is_like(self, other: "VibrationMode") -> bool:
+        """Whether two searches see one mode: nearly its frequency, or its shape somewhat beside it."""
+        change = abs(self.frequency_hz / other.frequency_hz - 1)
+        return change < _SAME or (change < _FAR and abs(float(self.shape @ other.shape)) > _SIMILAR)
 
 
 @dataclass(frozen=True)
@@ -122,6 +137,8 @@ def _pieces(time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray) -> t
 
 def _runs(time_s: FloatArray) -> list[slice]:
     """Frames of one rate without a gap, in pieces of about the same length."""
+    from scipy import ndimage
+
     intervals = np.diff(time_s)
     if intervals.size < 10:
         return []
@@ -181,6 +198,8 @@ def _noise(power: FloatArray, alias_hz: FloatArray) -> FloatArray:
 
 def _threshold(seen: FloatArray, frequencies: int) -> float:
     """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of these quantiles."""
+    from scipy import stats
+
     low, middle = np.quantile(seen, [0.1, 0.5])  # of the lower half, where neither lines nor their aliases are
     if not middle > low:
         return float("inf")  # nothing moves at all
@@ -233,3 +252,98 @@ def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
     first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
     own = [_refined(line, grid_hz, first + int(np.argmax(line[first:last])))[0] for line in lines]
     return float(np.std(own, ddof=1) / np.sqrt(len(own)))
+
+
+class Stethoscope:
+    """The mirror's vibrations while it is held, searched in each minute of tracked figures.
+
+    The first eight modes are followed. One that moves by 1 % from its first searches tells of another tension.
+    """
+
+    def __init__(self) -> None:
+        self._time_s: list[float] = []
+        self._terms_um: list[FloatArray] = []
+        self._modes: list[_Heard] = []
+        self._moved = False
+
+    def after(self, estimate: ShapeEstimate) -> list[events.Event]:
+        """Take a figure; once a minute, say what was heard, if ever there was something."""
+        if estimate.kind != "track" or estimate.verdict == "rejected":
+            return []
+        self._time_s.append(estimate.time_s)
+        self._terms_um.append(estimate.coeffs_um)
+        if estimate.time_s - self._time_s[0] < SEARCH_S:
+            return []
+        time_s, terms_um = np.array(self._time_s), np.array(self._terms_um)
+        self._time_s, self._terms_um = [], []
+        return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
+
+    def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
+        """Search a minute of terms (n, 36) at times (n,)."""
+        try:
+            found = find_modes(time_s, terms_um)
+        except ValueError:  # too many gaps
+            return []
+        for mode in self._modes:
+            mode.line = None
+        for line in found:
+            known = next((mode for mode in self._modes if mode.line is None and line.is_like(mode.last)), None)
+            if known is not None:
+                known.add(line)
+            elif len(self._modes) < MODES:
+                self._modes.append(_Heard(line))
+        if not self._modes:
+            return []
+        lines = [mode.line for mode in self._modes]
+        told = ", ".join(f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line)
+        heard = run_events.Vibrations(
+            [None if line is None else round(line.frequency_hz, 4) for line in lines],
+            [None if line is None else round(line.amplitude_nm, 2) for line in lines],
+            told or "none",
+        )
+        return [heard, *self._notices()]
+
+    def _notices(self) -> list[events.Event]:
+        """A notice when the first mode has moved, and when all are back."""
+        moved = [mode for mode in self._modes if abs(mode.moved) > (MOVED / 2 if self._moved else MOVED)]
+        if bool(moved) == self._moved:
+            return []
+        self._moved = not self._moved
+        if not moved:
+            return [events.MaintenanceOver("film_tension", "the mirror's vibrations are where they were")]
+        change, before_hz = moved[0].moved, moved[0].usual_hz
+        return [
+            events.Maintenance(
+                "film_tension",
+                f"the mirror's vibration at {before_hz:.2f} Hz moved by {change:+.1%}: the film's tension by "
+                f"{2 * change:+.1%}; check clamping and pressure",
+            )
+        ]
+
+
+class _Heard:
+    """A mode over the searches."""
+
+    def __init__(self, line: VibrationMode) -> None:
+        self.line: VibrationMode | None = line  # of the last search; None where it was not heard
+        self.last = line
+        self._first_hz: list[float] = []
+        self._last_hz: deque[float] = deque(maxlen=_SEARCHES)
+        self.add(line)
+
+    def add(self, line: VibrationMode) -> None:
+        """Take its line of a search."""
+        self.line = self.last = line
+        self._last_hz.append(line.frequency_hz)
+        if len(self._first_hz) < _SEARCHES:
+            self._first_hz.append(line.frequency_hz)
+
+    @property
+    def usual_hz(self) -> float:
+        """Frequency of the first searches."""
+        return float(np.median(self._first_hz))
+
+    @property
+    def moved(self) -> float:
+        """Relative change since, once there are enough searches."""
+        return float(np.median(self._last_hz)) / self.usual_hz - 1 if len(self._last_hz) == _SEARCHES else 0.0

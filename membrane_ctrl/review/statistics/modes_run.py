@@ -11,22 +11,17 @@ import numpy as np
 
 from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
 from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.track.modes import LEAST_S, VibrationMode, find_modes
+from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, LEAST_S, MOVED, SEARCH_S, VibrationMode, find_modes
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import is_run
 
-_SEARCH_S = 60.0
 _SEARCHES = 60  # of a run, evenly spread: a quarter of a second each
-_LEAST_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
-_SAME = 0.004  # relative: two searches see one mode, whatever the shapes
-_FAR, _ALIKE = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
 _SHOWN = 6  # modes in the picture
 _USUAL = 0.5  # share of the searches that a mode is in
 _LARGEST_UM = 1e6  # a term of a metre is none
 _FRAMES_MOST = 300_000  # of a set: four hours at 20 Hz
-_MOVED = 0.01  # relative: the film's tension has changed by 2 %
 
 
 @dataclass(frozen=True)
@@ -123,17 +118,17 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     if time_s.size < 2:
         raise errors.RejectedError(f"{folder}: no usable figures")
     interval_s = float(np.median(np.diff(time_s)))
-    if not interval_s * _LEAST_HZ <= 1:
+    if not interval_s * LEAST_RATE_HZ <= 1:
         raise errors.RejectedError(
-            f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; {_LEAST_HZ:g} a second are needed: "
-            'hold with shape.mode = "track"'
+            f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; {LEAST_RATE_HZ:g} a second are "
+            'needed: hold with shape.mode = "track"'
         )
     return time_s, coeffs_um, origin_s
 
 
 def _minutes(time_s: FloatArray) -> list[slice]:
     """Minutes of frames, evenly spread if there are many."""
-    _, first = np.unique(np.floor((time_s - time_s[0]) / _SEARCH_S), return_index=True)
+    _, first = np.unique(np.floor((time_s - time_s[0]) / SEARCH_S), return_index=True)
     edges = [*first, time_s.size]
     chosen = np.unique(np.linspace(0, len(first) - 1, min(len(first), _SEARCHES)).round().astype(int))
     return [slice(edges[k], edges[k + 1]) for k in chosen]
@@ -167,11 +162,7 @@ def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
 
 def _is_one(mode: SeenMode, line: VibrationMode, at_s: float) -> bool:
     """Whether a line is that mode in another search: nearly its frequency, or its shape somewhat beside it."""
-    last = mode.lines[-1]
-    change = line.frequency_hz / last.frequency_hz - 1
-    return at_s not in mode.time_s.tolist() and bool(
-        change < _SAME or (change < _FAR and abs(line.shape @ last.shape) > _ALIKE)
-    )
+    return at_s not in mode.time_s.tolist() and line.is_like(mode.lines[-1])
 
 
 def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:
@@ -208,7 +199,7 @@ def _lines(table: dict[str, Any]) -> list[str]:
             others = ", ".join(f"{alias:.2f}" for alias in mode["aliases_hz"])
             line += f"; or {others} Hz: the frames have one rate"
         lines.append(line)
-        if abs(mode["moved"]) > _MOVED:
+        if abs(mode["moved"]) > MOVED:
             lines.append(
                 f"           it moved by {mode['moved']:+.1%}: the film's tension by {2 * mode['moved']:+.1%}; check "
                 "clamping and pressure"

@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.film_shape import DRUM_MODES, DrumMode, FilmShape, FilmTerms, typical_film
 from membrane_ctrl.sim.optics.shade import (
     Light,
     cubic_weights,
@@ -50,7 +50,9 @@ class OpticsRenderer:
     screen_error: ScreenError | None = None
     exact: bool = False
     seed: int = 0
+    modes: tuple[DrumMode, ...] = ()
     _traces: OrderedDict[float, FloatArray] = field(default_factory=OrderedDict, init=False, repr=False)
+    _swings: dict[DrumMode, FloatArray] = field(default_factory=dict, init=False, repr=False)
     _pictures: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -78,12 +80,17 @@ class OpticsRenderer:
         return np.empty(shape, np.uint16)
 
     def render(
-        self, pattern: Pattern, displacement_um: float, out: Pixels | None = None, gain: float = 1.0
+        self,
+        pattern: Pattern,
+        displacement_um: float,
+        out: Pixels | None = None,
+        gain: float = 1.0,
+        time_s: float = 0.0,
     ) -> Pixels:
         """The picture of one pattern, (H, W), at a displacement; `gain` is the exposure over the nominal one.
 
-        `out` (as of `blank`) is filled and returned; otherwise a new array is made. Raises ValueError if the pattern
-        is unknown or `out` has another shape or type.
+        `out` (as of `blank`) is filled and returned; otherwise a new array is made. The vibrations are those of
+        `time_s`. Raises ValueError if the pattern is unknown or `out` has another shape or type.
         """
         camera = self.optics.camera
         picture = self.blank() if out is None else out
@@ -94,7 +101,11 @@ class OpticsRenderer:
             )
         self._pictures += 1
         paint = self._crossed(pattern, gain) if pattern.role == "crossed" else self._striped(pattern, gain)
-        nodes, seed = self._nodes(displacement_um), (self.seed << 32) + self._pictures
+        nodes = self._nodes(displacement_um)
+        for mode in self.modes:
+            swing_um = mode.amplitude_nm / 1e3 * np.sin(2 * np.pi * mode.frequency_hz * time_s + mode.lobes)
+            nodes = nodes + swing_um * self._swing_maps(mode)
+        seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
         other = _second_hand().submit(paint, nodes, seed, picture, middle, camera.height_px)
         paint(nodes, seed, picture, 0, middle)
@@ -157,10 +168,10 @@ class OpticsRenderer:
         directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
         return self._trace(directions, displacement_um)
 
-    def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
+    def _trace(self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None) -> Trace:
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
-        film = self.film.terms_at(displacement_um)
+        film = film or self.film.terms_at(displacement_um)
         return trace(self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose)
 
     def _nodes(self, displacement_um: float) -> FloatArray:
@@ -176,13 +187,27 @@ class OpticsRenderer:
         if displacement_um in self._traces:
             self._traces.move_to_end(displacement_um)
             return self._traces[displacement_um]
-        found = self._trace(self._directions, displacement_um)
-        half_side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm / 2.0
-        maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
-        self._traces[displacement_um] = maps.reshape(3, len(self._rows), len(self._columns))
+        maps = self._maps(self._trace(self._directions, displacement_um))
+        self._traces[displacement_um] = maps
         while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
             self._traces.popitem(last=False)
-        return self._traces[displacement_um]
+        return maps
+
+    def _swing_maps(self, mode: DrumMode) -> FloatArray:
+        """Change of the maps at the nodes by 1 um of a mode: linear to 1e-4 of it, at any displacement."""
+        if mode not in self._swings:
+            still, moved = (
+                self._maps(self._trace(self._directions, 0.0, film))
+                for film in (self.film.terms_at(0.0), mode.moved(self.film))
+            )
+            self._swings[mode] = moved - still
+        return self._swings[mode]
+
+    def _maps(self, found: Trace) -> FloatArray:
+        """Screen point from the region's low edges, squared distance from the vertex: (3, rows, columns)."""
+        half_side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm / 2.0
+        maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
+        return maps.reshape(3, len(self._rows), len(self._columns))
 
 
 @cache
@@ -261,7 +286,7 @@ class TwinOptics:
     def _expose(self, pattern: Pattern, out: Pixels | None) -> Frame:
         renderer = self._looked()
         time_s = self._clock.now()
-        return Frame(renderer.render(pattern, self._truth().displacement_um, out), time_s)
+        return Frame(renderer.render(pattern, self._truth().displacement_um, out, time_s=time_s), time_s)
 
     def _looked(self) -> OpticsRenderer:
         if self._renderer is None:
@@ -271,7 +296,11 @@ class TwinOptics:
             film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed, *material)
             stated = self._optics.geometry.reference_displacement_um
             reference_um = position.displacement_um if stated is None else stated
-            self._renderer = OpticsRenderer(self._optics, film, reference_um=reference_um, seed=self._seed)
+            swing_nm = self._twin.drum_nm
+            modes = tuple(replace(mode, amplitude_nm=swing_nm) for mode in DRUM_MODES) if swing_nm else ()
+            self._renderer = OpticsRenderer(
+                self._optics, film, reference_um=reference_um, seed=self._seed, modes=modes
+            )
         return self._renderer
 
 

@@ -5,7 +5,7 @@ the bowl has `sag_mm`; the rim stays where it is, so the bowl is `sag_mm + displ
 moves with the rim.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import comb, cos, exp, factorial, isfinite, pi, radians, sin, sqrt
 from typing import Literal, NamedTuple
@@ -303,6 +303,33 @@ def _terms(film: FilmShape) -> FilmTerms:
     )
     vertex_mm = height_and_slopes(raised, film.sag_mm, 0.0, 0.0)[0]
     return raised._replace(offset_mm=vertex_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class DrumMode:
+    """A vibration of the film: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
+
+    frequency_hz: float
+    lobes: int  # m
+    circles: int  # n
+    amplitude_nm: float = 1.0  # RMS over the mirror
+
+    def moved(self, film: FilmShape) -> FilmTerms:
+        """The film displaced by 1 um RMS, its ring at rest; 36 terms hold the first modes to 1 %."""
+        from scipy import special
+
+        x, y = (side.ravel() for side in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 201)]))
+        inside = x * x + y * y < 1.0
+        x, y = x[inside], y[inside]
+        zero = special.jn_zeros(self.lobes, self.circles)[-1]
+        height = special.jv(self.lobes, zero * np.hypot(x, y)) * np.cos(self.lobes * np.arctan2(y, x))
+        terms = [np.polynomial.polynomial.polyval2d(x, y, polynomial(one)) for one in np.eye(MAX_ZERNIKE)]
+        moved_um = np.linalg.lstsq(np.array(terms).T, height / np.sqrt(np.mean(height**2)), rcond=None)[0]
+        moved_um[: len(film.zernike_um)] += film.zernike_um
+        return replace(film, zernike_um=tuple(moved_um.tolist())).terms._replace(offset_mm=film.terms.offset_mm)
+
+
+DRUM_MODES = (DrumMode(27.0, 0, 1), DrumMode(48.0, 1, 1), DrumMode(57.0, 2, 1), DrumMode(61.0, 0, 2))
 
 
 def typical_film(

@@ -13,11 +13,14 @@ from scipy.integrate import quad
 from membrane_ctrl.metrology.optics.film_law import FilmLaw
 from membrane_ctrl.sim import film as hencky
 from membrane_ctrl.sim.optics.film_shape import (
+    DRUM_MODES,
     Bump,
+    DrumMode,
     FilmShape,
     Ripple,
     Wrinkle,
     height_and_slopes,
+    heights,
     hencky_series,
     noll_orders,
     typical_film,
@@ -160,3 +163,19 @@ def test_films_cross_to_another_process() -> None:
     x, y = np.array([200.0]), np.array([-100.0])
     assert there == RICH
     assert there.height_mm(x, y) == RICH.height_mm(x, y)
+
+
+@pytest.mark.parametrize("mode", DRUM_MODES)
+def test_a_drum_mode_moves_the_film_inside_its_ring(mode: DrumMode) -> None:
+    film = FilmShape(37.1, zernike_um=(0.0, 0.0, 0.0, 2.0, 1.0))
+    x, y = (side.ravel() for side in np.meshgrid(*2 * [np.linspace(-500.0, 500.0, 141)]))
+    inside = np.hypot(x, y) < 500.0
+    x, y = x[inside], y[inside]
+    moved_um = 1e3 * (heights(mode.moved(film), 37.1, x, y) - heights(film.terms, 37.1, x, y))
+    assert np.sqrt(np.mean(moved_um**2)) == pytest.approx(1.0, rel=0.02)
+    angle = np.linspace(0, 2 * np.pi, 36)
+    ring = 500.0 * np.cos(angle), 500.0 * np.sin(angle)
+    assert np.abs(1e3 * (heights(mode.moved(film), 37.1, *ring) - heights(film.terms, 37.1, *ring))).max() < 0.1
+    along = moved_um[(np.abs(y) < 1e-9) & (np.abs(x) > 20.0) & (np.abs(x) < 480.0)]
+    crossings = np.count_nonzero(np.diff(np.sign(along)))
+    assert crossings == {(0, 1): 0, (1, 1): 1, (2, 1): 0, (0, 2): 2}[mode.lobes, mode.circles]
