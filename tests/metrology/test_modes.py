@@ -115,12 +115,12 @@ def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeyp
         found = (event for minute in heard(monkeypatch, minutes) for event in minute)
         return [event for event in found if not isinstance(event, Vibrations)]
 
-    usual, lower, near = {3: 48.0, 7: 61.0}, {3: 47.4, 7: 61.0}, {3: 48.2, 7: 61.0}
+    usual, lower, near = {3: 48.0, 7: 61.0}, {3: 47.3, 7: 61.0}, {3: 48.2, 7: 61.0}
     assert told(10 * [usual] + 10 * [near]) == []
     moved, *again = told(6 * [usual] + 2 * [lower] + 6 * [usual] + 6 * [lower] + 6 * [usual])
     assert isinstance(moved, Maintenance)
     assert moved.name == "film_tension"
-    assert "48.00 Hz moved by -1.2%: the film's tension by -2.5%" in moved.message
+    assert "48.00 Hz moved by -1.5%: the film's tension by -2.9%" in moved.message
     assert [type(event) for event in again] == [MaintenanceOver]
 
 

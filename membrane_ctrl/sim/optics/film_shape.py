@@ -5,7 +5,7 @@ the bowl has `sag_mm`; the rim stays where it is, so the bowl is `sag_mm + displ
 moves with the rim.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from math import comb, cos, exp, factorial, isfinite, pi, radians, sin, sqrt
 from typing import Literal, NamedTuple
@@ -17,9 +17,6 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 
 MAX_ZERNIKE = 36  # all terms of radial order 7 or less
-
-
-# Height and slopes of the film at a point: the compiled kernel that the ray tracer calls.
 
 
 class FilmTerms(NamedTuple):
@@ -110,7 +107,6 @@ def paraboloid_series() -> FloatArray:
 
 
 # Zernike terms in Noll's order as polynomials in x and y, orthonormal (unit RMS) over the unit disc.
-#
 # The twin's own implementation: it shares nothing with the reconstruction it is used to check.
 # Source: R. J. Noll, "Zernike polynomials and atmospheric turbulence", JOSA 66, 207 (1976).
 
@@ -307,7 +303,7 @@ def _terms(film: FilmShape) -> FilmTerms:
 
 @dataclass(frozen=True, slots=True)
 class DrumMode:
-    """A vibration of the film: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
+    """A vibration: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
 
     frequency_hz: float
     lobes: int  # m
@@ -315,20 +311,23 @@ class DrumMode:
     amplitude_nm: float = 1.0  # RMS over the mirror
 
     def moved(self, film: FilmShape) -> FilmTerms:
-        """The film displaced by 1 um RMS, its ring at rest; 36 terms hold the first modes to 1 %."""
+        """The film displaced by 1 um RMS, its ring at rest."""
         from scipy import special
 
-        x, y = (side.ravel() for side in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 201)]))
-        inside = x * x + y * y < 1.0
-        x, y = x[inside], y[inside]
-        zero = special.jn_zeros(self.lobes, self.circles)[-1]
-        height = special.jv(self.lobes, zero * np.hypot(x, y)) * np.cos(self.lobes * np.arctan2(y, x))
-        terms = [np.polynomial.polynomial.polyval2d(x, y, polynomial(one)) for one in np.eye(MAX_ZERNIKE)]
-        moved_um = np.linalg.lstsq(np.array(terms).T, height / np.sqrt(np.mean(height**2)), rcond=None)[0]
-        moved_um[: len(film.zernike_um)] += film.zernike_um
-        return replace(film, zernike_um=tuple(moved_um.tolist())).terms._replace(offset_mm=film.terms.offset_mm)
+        m, terms, zero = self.lobes, film.terms_at(0.0), special.jn_zeros(self.lobes, self.circles)[-1]
+        rms = abs(special.jv(m + 1, zero)) * (sqrt(0.5) if m else 1.0)
+        poly_mm = np.zeros((2 * _SERIES + m + 1,) * 2)
+        poly_mm[: terms.poly_mm.shape[0], : terms.poly_mm.shape[1]] = terms.poly_mm
+        for k in range(_SERIES + 1):
+            part_mm = 1e-3 / rms * (-1) ** k * (zero / 2) ** (2 * k + m) / (factorial(k) * factorial(k + m))
+            for p, q in np.ndindex(k + 1, m // 2 + 1):  # (x^2 + y^2)^k Re (x + i y)^m
+                poly_mm[2 * (k - p + m // 2 - q) + m % 2, 2 * (p + q)] += (
+                    part_mm * comb(k, p) * comb(m, 2 * q) * (-1) ** q
+                )
+        return terms._replace(poly_mm=poly_mm)
 
 
+_SERIES = 12  # powers of (r / radius)^2: J_0 and J_2 to 1e-6 beyond their second zeros
 DRUM_MODES = (DrumMode(27.0, 0, 1), DrumMode(48.0, 1, 1), DrumMode(57.0, 2, 1), DrumMode(61.0, 0, 2))
 
 
