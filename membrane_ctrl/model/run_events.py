@@ -134,8 +134,8 @@ class Capture(Event, kind="capture"):
 class Vibrations(Event, kind="vibrations"):
     """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it was not heard."""
 
-    frequency_hz: list[float | None]
-    amplitude_nm: list[float | None]  # RMS over the mirror
+    frequency_hz: Any  # list of numbers and None
+    amplitude_nm: Any  # as above, RMS over the mirror
     message: str
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from membrane_ctrl.metrology.track import modes
 from membrane_ctrl.metrology.track.modes import Stethoscope, VibrationMode, find_modes
-from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
-from membrane_ctrl.model.run_events import Vibrations
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, sentence
+from membrane_ctrl.model.run_events import Vibrations, from_dict
 from tests.support.vibrating_mirror import watched
 
 
@@ -130,3 +130,9 @@ def test_a_listener_hears_what_is_planted() -> None:
     (told,) = Stethoscope().search(time_s, coeffs_um)
     assert isinstance(told, Vibrations)
     assert told.frequency_hz == pytest.approx([planted[0].frequency_hz], abs=0.05)
+
+
+def test_what_was_heard_survives_the_line_to_the_hold_and_has_a_sentence() -> None:
+    event = Vibrations([48.0, None], [5.0, None], "48.00 Hz 5.0 nm")
+    assert from_dict(event.to_dict()) == event
+    assert sentence(event.to_dict()) == "Vibrations of the mirror: 48.00 Hz 5.0 nm"
