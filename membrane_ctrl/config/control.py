@@ -272,10 +272,8 @@ class EstimatorConfig(Section):
     """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
     centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.05
     """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
-    leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.025
-    """Unrest of the leak: a larger one answers a new leak sooner and passes more noise.
-    Change it with the measured peak after a leak."""
-    leak_walk_optics_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.1
-    """The same while the optics are there, whose noise is smaller. Change it likewise."""
+    leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
+    """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak that changes slowly:
+    it then follows sooner and passes more noise."""
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
     """Walk of the laser's mount: 0.2 um in an hour. Change it to your mount's."""

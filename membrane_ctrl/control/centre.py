@@ -11,13 +11,13 @@ late reading is exact, whenever it comes.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
-from membrane_ctrl.control.filters import WalkNoise, Whiteness, smoothing
+from membrane_ctrl.control.filters import NoiseLevels, Ramp, smoothing
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -28,13 +28,14 @@ _CLONE_S = 0.02  # least time between clones
 _GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain may miss
 _HUBER2, _FAR2, _FAR_COUNT = 9.0, 25.0, 3  # squared sigmas: weighed less beyond the first, dropped beyond the second
 LOCK_FRAMES = 5
-_FRAME_S = 0.05  # interval of frames from which on the optics' own `leak_walk` applies
 _FRAMES_LOST = 3  # after this many missing frames the optics are gone
 _INTERVAL_SHARE = 0.2  # of a new interval in their mean
 _IMPOSSIBLE = 1e4  # um, Pa or K: no film, weather or mount moves that far in a hold
 _UNKNOWN_UM2 = 1e6  # variance of the optics' zero before lock
 _LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the start
 _SHARE_S = 2.0  # memory of the sensors' weights
+# of a leak's ramp, in standard deviations: seldom by chance, for what the laser's noise makes of it is larger
+_RUN = {Sensor.LASER: 14.0, Sensor.OPTICS: 8.0}
 _OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
 Rows = tuple[tuple[int, float], ...]  # states and their factors in a reading's expectation
 
@@ -49,16 +50,6 @@ class _Watch:
     pull: float = 0.0  # recent sum of gains on the centre
     far: int = 0  # readings in a row beyond the outer limit
     far_since_s: float = math.nan
-
-
-@dataclass(slots=True)
-class _Noises:
-    """Noise levels, learned within bounds."""
-
-    laser: WalkNoise
-    barometer: WalkNoise
-    thermometer: WalkNoise
-    centre: Whiteness = field(default_factory=Whiteness)
 
 
 class CentreFilter:
@@ -93,18 +84,15 @@ class CentreFilter:
             self._p[i, i] = variance
         self._origin = [math.nan, math.nan, math.nan]  # first pressure, air temperature, sag
         self._watches = [_Watch() for _ in Sensor]
-        self._noises = _Noises(
-            WalkNoise(config.laser_noise_um, 0.1, rate_hz),
-            WalkNoise(config.barometer_noise_pa, config.pressure_walk_pa_per_root_s, rate_hz),
-            WalkNoise(config.thermometer_noise_k, config.air_walk_k_per_root_s, rate_hz),
-        )
+        self._levels = {sensor: NoiseLevels() for sensor in Sensor}
+        self._levels[Sensor.OPTICS] = NoiseLevels(self._levels[Sensor.LASER])
         self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
         self._transit.place(flow_um_per_s)
+        self._ramps = {sensor: Ramp(limit) for sensor, limit in _RUN.items()}
         self._jumped: list[str] = []
         self.frames = 0  # of the optics since lock
         self._frame_interval_s = FRESH_S[Sensor.OPTICS]
         self._last_frame_s = -math.inf
-        self._leak_walk_was = config.leak_walk_um_per_s_per_root_s
 
     def relock(self) -> None:
         """Take the optics' next readings as a new zero."""
@@ -117,26 +105,23 @@ class CentreFilter:
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""
         self._jumped = []
-        self._predict(given.now_s, given.flow_um_per_s, dt_s)
+        self._predict(given.flow_um_per_s, dt_s)
         self._clone(given.now_s)
         for watch in self._watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
         pressure_pa, air_c = believed_weather(given.ambient_pressure_pa, given.air_temperature_c)
-        noises = self._noises
+        config = self._config
         if self._uses[0] and math.isfinite(pressure_pa):
             pressure_pa = self._from_origin(0, pressure_pa)
-            noises.barometer.update(pressure_pa, dt_s)
-            self._take(Sensor.BAROMETER, ((_AMBIENT, 1.0),), pressure_pa, noises.barometer.variance, given.now_s)
+            self._take(Sensor.BAROMETER, ((_AMBIENT, 1.0),), pressure_pa, config.barometer_noise_pa**2, given.now_s)
         if self._uses[1] and math.isfinite(air_c):
             air_k = self._from_origin(1, air_c)
-            noises.thermometer.update(air_k, dt_s)
-            self._take(Sensor.THERMOMETER, ((_AIR, 1.0),), air_k, noises.thermometer.variance, given.now_s)
+            self._take(Sensor.THERMOMETER, ((_AIR, 1.0),), air_k, config.thermometer_noise_k**2, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
         if math.isfinite(given.laser_um):
-            noises.laser.update(given.laser_um, dt_s)
             rows = (*self._centre_rows(), (_MOUNT, 1.0))
-            self._take(Sensor.LASER, rows, given.laser_um, noises.laser.variance, given.now_s)
+            self._take(Sensor.LASER, rows, given.laser_um, config.laser_noise_um**2, given.now_s)
         return self._estimate(given.now_s)
 
     def _centre_rows(self) -> Rows:
@@ -148,7 +133,7 @@ class CentreFilter:
             self._origin[which] = value
         return value - self._origin[which]
 
-    def _predict(self, now_s: float, flow_um_per_s: float, dt_s: float) -> None:
+    def _predict(self, flow_um_per_s: float, dt_s: float) -> None:
         x, p, config = self._x, self._p, self._config
         follow = smoothing(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(flow_um_per_s, dt_s) - x[_LEAK] * dt_s
@@ -156,26 +141,11 @@ class CentreFilter:
         for matrix in (p, p.T):
             matrix[_GAS] -= dt_s * matrix[_LEAK]
             matrix[_WARMTH] += follow * (matrix[_AIR] - matrix[_WARMTH])
-        walk = self._noises.barometer.walk
-        missed = _GAIN_ERROR**2 * self._pressure_gain**2 * walk
-        p[_GAS, _GAS] += dt_s * self._noises.centre.factor * (config.centre_walk_um_per_root_s**2 + missed)
-        leak_walk = self._leak_walk(now_s)
-        if leak_walk < self._leak_walk_was:  # the optics are gone: the leak has not changed as fast as it might have
-            p[_LEAK] *= leak_walk / self._leak_walk_was
-            p[:, _LEAK] *= leak_walk / self._leak_walk_was
-        self._leak_walk_was = leak_walk
-        p[_LEAK, _LEAK] += dt_s * leak_walk**2
-        p[_AMBIENT, _AMBIENT] += dt_s * walk
-        p[_AIR, _AIR] += dt_s * self._noises.thermometer.walk
+        p[_GAS, _GAS] += dt_s * self._centre_walk()
+        p[_LEAK, _LEAK] += dt_s * config.leak_walk_um_per_s_per_root_s**2
+        p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
+        p[_AIR, _AIR] += dt_s * self._air_walk()
         p[_MOUNT, _MOUNT] += dt_s * config.mount_walk_um_per_root_s**2
-
-    def _leak_walk(self, now_s: float) -> float:
-        """What is taken for a leak's change: more if frequent frames show it than if the laser's noise hides it."""
-        config = self._config
-        if not self._fresh(Sensor.OPTICS, now_s):
-            return config.leak_walk_um_per_s_per_root_s
-        by_optics = config.leak_walk_optics_um_per_s_per_root_s * min(1.0, _FRAME_S / self._frame_interval_s)
-        return max(config.leak_walk_um_per_s_per_root_s, by_optics)
 
     def _clone(self, now_s: float) -> None:
         """Remember the centre of this tick in the oldest clone."""
@@ -230,20 +200,27 @@ class CentreFilter:
         """Use one reading, whose expectation is the sum of states times factors, by how well it fits."""
         taken_s = now_s if math.isnan(taken_s) else taken_s
         watch, x, p = self._watches[sensor], self._x, self._p
-        innovation = value - sum(factor * x[i] for i, factor in rows)
+        variance *= self._levels[sensor].reading
+        innovation = float(value - sum(factor * x[i] for i, factor in rows))
         if abs(innovation) > _IMPOSSIBLE:
             return
-        ph = sum(factor * p[i] for i, factor in rows)
-        spread = sum(factor * ph[i] for i, factor in rows) + variance
+        ph, spread = self._spread(rows, variance)
         squared = innovation**2 / spread
-        watch.innovation = float(innovation / math.sqrt(spread))
-        if self._doubted(sensor, squared, taken_s, now_s):
+        watch.innovation = innovation / math.sqrt(spread)
+        leads = sensor != Sensor.LASER or not self._fresh(Sensor.OPTICS, now_s)
+        ramp = self._ramps.get(sensor) if leads else None
+        runs = ramp is not None and ramp.update(watch.innovation, taken_s)
+        if self._doubted(sensor, squared, taken_s, now_s) and not runs:
             return
-        if watch.far:
-            self._open(sensor, float(innovation), now_s)
+        if watch.far >= _FAR_COUNT:
+            self._open(sensor, innovation, now_s)
+        elif not watch.far:
+            self._learn(sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads)
+        if ramp is not None and runs:
+            self._widen_leak(ramp, now_s, math.sqrt(spread))
+        if watch.far or runs:
             watch.far = 0
-            ph = sum(factor * p[i] for i, factor in rows)
-            spread = sum(factor * ph[i] for i, factor in rows) + variance
+            ph, spread = self._spread(rows, variance)
         elif squared > _HUBER2:
             spread *= squared / _HUBER2
         gain = ph / spread
@@ -252,8 +229,33 @@ class CentreFilter:
         watch.seen_s, watch.taken_s = now_s, taken_s
         if sensor in (Sensor.LASER, Sensor.OPTICS):
             watch.pull += abs(float(sum(share * gain[i] for i, share in self._centre_rows())))
-            if sensor == Sensor.OPTICS or not self._fresh(Sensor.OPTICS, now_s):
-                self._noises.centre.update(float(innovation), float(spread), now_s)
+
+    def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
+        """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
+        levels, innovation = self._levels, self._watches[sensor].innovation
+        if not leads:
+            levels[sensor].learn(innovation, share, dt_s, 0.0)
+        elif sensor in self._ramps:
+            by_air = self._air_walk() * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
+            blame = (own := self._centre_walk()) / (own + by_air)
+            levels[sensor].learn(innovation, share, dt_s, blame, levels[Sensor.THERMOMETER])
+        else:
+            levels[sensor].learn(innovation, share, dt_s)
+
+    def _pressure_walk(self) -> float:
+        return self._levels[Sensor.BAROMETER].walk * self._config.pressure_walk_pa_per_root_s**2
+
+    def _air_walk(self) -> float:
+        return self._levels[Sensor.THERMOMETER].walk * self._config.air_walk_k_per_root_s**2
+
+    def _centre_walk(self) -> float:
+        missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
+        return self._levels[Sensor.LASER].walk * (self._config.centre_walk_um_per_root_s**2 + missed)
+
+    def _spread(self, rows: Rows, variance: float) -> tuple[FloatArray, float]:
+        """Covariance of all states with a reading's expectation, and the variance of its innovation."""
+        ph: FloatArray = np.asarray(sum(factor * self._p[i] for i, factor in rows))
+        return ph, float(sum(factor * ph[i] for i, factor in rows)) + variance
 
     def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
         """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a single bad one.
@@ -290,6 +292,14 @@ class CentreFilter:
         jump = np.zeros_like(self._x)
         jump[state] = by
         jump[_PLANT:][self._times >= since_s] = on_centre * by
+        self._p += jump[:, None] * jump
+
+    def _widen_leak(self, ramp: Ramp, now_s: float, sigma_um: float) -> None:
+        """The leak may have changed when the innovations began to run away."""
+        since_s, by = ramp.since_s, ramp.slope * sigma_um
+        jump = np.zeros_like(self._x)
+        jump[_LEAK], jump[_GAS] = -by, by * (now_s - since_s)
+        jump[_PLANT:] = by * np.maximum(self._times - since_s, 0.0)
         self._p += jump[:, None] * jump
 
     def _fresh(self, sensor: Sensor, now_s: float) -> bool:

@@ -1,7 +1,6 @@
-"""Filters of single signals: first-order for unequal steps, drift, noise levels learned from the readings. Pure."""
+"""Filters of single signals: first-order for unequal steps, drift; noise levels and ramps in innovations. Pure."""
 
 import math
-from collections import deque
 
 
 def smoothing(dt_s: float, time_constant_s: float) -> float:
@@ -140,76 +139,96 @@ class DriftTracker:
         self._time_s = time_s
 
 
-_MEMORY_S = 100.0
-_LAG_S = 1.0  # of the longer difference
-_NOISE_BOUND, _WALK_BOUND = 5.0**2, 30.0**2  # times and parts of the configured variance
-_OUTLIER2 = 25.0
-_BLOCK_S, _GAIN, _FACTOR_BOUND = 0.5, 0.02, 100.0  # of `Whiteness`
+_MEMORY_S = 200.0
+_LIMIT = 3.0  # an innovation beyond this many standard deviations counts as this many
+_READING_BOUND, _WALK_BOUND = math.log(5.0**2), math.log(30.0**2)
+_SLACK, _STEEPEST, _SHORTEST_S = 0.5, 4.0, 0.02  # of a ramp: two bad readings are none
+# information in a noise that comes with the reading, in a configured one, and in a configured walk
+_STATED, _CONFIGURED, _UNREST = 250.0, 25.0, 4.0
 
 
-def _within(value: float, configured: float, bound: float) -> float:
-    return min(max(value, configured / bound), configured * bound)
+class Level:
+    """A factor on a variance; its logarithm follows the likelihood's slope over the information so far."""
+
+    def __init__(self, bound: float, information: float) -> None:
+        self._bound, self._information, self._log = bound, information, 0.0
+
+    @property
+    def factor(self) -> float:
+        """Present factor."""
+        return math.exp(self._log)
+
+    def learn(self, slope: float, information: float, forget: float) -> None:
+        """Take the slope of the log-likelihood from one reading, and the information that it bears."""
+        self._information += information - forget * self._information
+        self._log = min(max(self._log + slope / self._information, -self._bound), self._bound)
 
 
-def _squared(difference: float, mean: float) -> float:
-    """The square of a difference, limited to some times the mean square: an outlier is no noise."""
-    return min(abs(difference), math.sqrt(_OUTLIER2 * mean)) ** 2
+class NoiseLevels:
+    """Factors on the variances of a sensor's readings and of the walk that it sees.
 
-
-class WalkNoise:
-    """Variance of a reading's noise, and of the walk per second under it.
-
-    Squared differences of readings a tick and a second apart are 2 r + q dt and 2 r + q 1 s.
+    The innovations are to be of unit variance, which sets the scale of both, and white, which sets their ratio: they
+    correlate positively where the filter follows too slowly, negatively where it follows noise.
     """
 
-    def __init__(self, noise: float, walk_per_root_s: float, rate_hz: float) -> None:
-        self._noise, self._walk = noise**2, walk_per_root_s**2
-        steps = max(2, round(_LAG_S * rate_hz))
-        self._values: deque[float] = deque(maxlen=steps + 1)
-        self._lag_s = steps / rate_hz
-        self._short = 2 * self._noise + self._walk / rate_hz
-        self._long = 2 * self._noise + self._walk * self._lag_s
-        self._period_s = 1 / rate_hz
-        self.variance, self.walk = self._noise, self._walk
+    def __init__(self, sees: "NoiseLevels | None" = None) -> None:
+        self._reading = Level(_READING_BOUND, _STATED if sees else _CONFIGURED)
+        self._walk = sees._walk if sees else Level(_WALK_BOUND, _UNREST)
+        self._past = 0.0  # how the past innovations would have moved the state, of unit variance
 
-    def update(self, value: float, dt_s: float) -> None:
-        """Take a reading."""
-        values = self._values
-        if values:
-            share = dt_s / _MEMORY_S
-            self._short += share * (_squared(value - values[-1], self._short) - self._short)
-            if len(values) == values.maxlen:
-                self._long += share * (_squared(value - values[0], self._long) - self._long)
-                walk = (self._long - self._short) / (self._lag_s - self._period_s)
-                self.walk = _within(walk, self._walk, _WALK_BOUND)
-                self.variance = _within((self._short - self.walk * self._period_s) / 2, self._noise, _NOISE_BOUND)
-        values.append(value)
+    @property
+    def reading(self) -> float:
+        """Factor on the variance of the readings."""
+        return self._reading.factor
+
+    @property
+    def walk(self) -> float:
+        """Factor on the variance of the walk."""
+        return self._walk.factor
+
+    def learn(
+        self, innovation: float, share: float, dt_s: float, blame: float = 1.0, other: "NoiseLevels | None" = None
+    ) -> None:
+        """Take an innovation in standard deviations, and the share of its variance that is the state's.
+
+        `blame` is the part of the walk in what moves the state, 0 for a sensor that does not lead; the rest is the
+        `other`'s walk.
+        """
+        forget = min(1.0, dt_s / _MEMORY_S)
+        innovation = min(max(innovation, -_LIMIT), _LIMIT)
+        size, runs = (innovation**2 - 1) / 2, math.sqrt(share / 8) * innovation * self._past
+        known = share / 8
+        leads = other is not None or blame > 0
+        by_noise = 1 - share / 2  # change of the innovations' variance with the noise, both as logarithms
+        self._reading.learn(by_noise * size - leads * runs, by_noise**2 / 2 + leads * known, forget)
+        for walk, part in ((self._walk, blame), (other._walk if other else None, 1 - blame)):
+            if walk and part > 0:
+                walk.learn(part * (share / 2 * size + runs), part**2 * (share**2 / 8 + known), forget)
+        self._past = (1 - share) * self._past + math.sqrt(share * (2 - share)) * innovation
 
 
-class Whiteness:
-    """Factor on a walk's variance that makes a filter's innovations white.
+class Ramp:
+    """Finds innovations that run away to one side: two cumulative sums (Page 1954)."""
 
-    Means of innovations over blocks correlate positively where the filter follows too slowly, negatively where it
-    follows noise.
-    """
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._sums, self._counts, self._began_s = [0.0, 0.0], [0, 0], [math.nan, math.nan]
+        self._last_s = math.nan
+        self.since_s = self.slope = math.nan  # of the last one: when it began, and its rise per second
 
-    def __init__(self) -> None:
-        self.factor = 1.0
-        self._block_s = math.nan
-        self._sum = self._spread = 0.0
-        self._last = math.nan
-
-    def update(self, innovation: float, spread: float, now_s: float) -> None:
-        """Take an innovation and its expected variance."""
-        if math.isnan(self._block_s):
-            self._block_s = now_s
-        self._sum += innovation
-        self._spread += spread
-        if now_s - self._block_s < _BLOCK_S:
-            return
-        mean = max(-3.0, min(3.0, self._sum / math.sqrt(self._spread)))
-        if math.isfinite(self._last):
-            step = _GAIN * mean * self._last
-            self.factor = min(max(self.factor * math.exp(step), 1 / _FACTOR_BOUND), _FACTOR_BOUND)
-        self._last, self._block_s = mean, now_s
-        self._sum = self._spread = 0.0
+    def update(self, innovation: float, taken_s: float) -> bool:
+        """Take an innovation in standard deviations; returns whether a ramp is found."""
+        found = False
+        innovation = min(max(innovation, -_STEEPEST), _STEEPEST)
+        for side, sign in enumerate((1.0, -1.0)):
+            if self._sums[side] == 0.0:
+                self._began_s[side], self._counts[side] = self._last_s, 0
+            self._counts[side] += 1
+            self._sums[side] = max(0.0, self._sums[side] + sign * innovation - _SLACK)
+            if self._sums[side] > self._limit:
+                mean = sign * (self._sums[side] / self._counts[side] + _SLACK)
+                self.since_s = self._began_s[side]
+                self.slope = 2 * mean / max(taken_s - self.since_s, _SHORTEST_S)
+                found, self._sums[side] = math.isfinite(self.since_s), 0.0
+        self._last_s = taken_s
+        return found

@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, Transit
-from membrane_ctrl.control.filters import WalkNoise, Whiteness
+from membrane_ctrl.control.filters import NoiseLevels, Ramp
 from tests.support.second_world import ForeignPlant, ForeignPump
 
 LOOP = LoopConfig()
@@ -88,8 +88,8 @@ MOUNT, STAND = np.eye(7)[5], np.eye(7)[6]
 @pytest.fixture
 def fixed_noises(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is learned."""
-    for learned in (WalkNoise, Whiteness):
-        monkeypatch.setattr(learned, "update", lambda *_: None)
+    monkeypatch.setattr(NoiseLevels, "learn", lambda *_: None)
+    monkeypatch.setattr(Ramp, "update", lambda *_: False)
     monkeypatch.setattr(centre, "FRESH_S", dict.fromkeys(Sensor, -1.0))
     monkeypatch.setattr(centre, "_HUBER2", math.inf)
     monkeypatch.setattr(centre, "_FAR2", math.inf)
@@ -351,22 +351,57 @@ def test_transit_is_a_dead_time_and_a_lag(delay_s: float, lag_s: float) -> None:
 # Noise levels.
 
 
-@pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.05), (0.05, 1.0), (0.15, 0.3), (0.02, 0.3)])
+def _follow(levels: NoiseLevels, noise: float, walk: float, steps: int = 20_000) -> list[float]:
+    """Follow a walk seen with noise, both told as 1 a step, with what is learned; the last 5,000 error to sigma."""
+    rng = np.random.default_rng(4)
+    true = estimate = 0.0
+    p, errors = 1.0, []
+    for moved, off in (rng.standard_normal((steps, 2)) * (walk, noise)).tolist():
+        true += moved
+        p += levels.walk
+        spread = p + levels.reading
+        innovation = true + off - estimate
+        levels.learn(innovation / math.sqrt(spread), p / spread, DT_S)
+        estimate += p / spread * innovation
+        p *= levels.reading / spread
+        errors.append((estimate - true) / math.sqrt(p))
+    return errors[-5000:]
+
+
+@pytest.mark.parametrize(("noise", "walk"), [(1.0, 1.0), (0.3, 0.3), (3.0, 0.3), (1.0, 5.0), (2.0, 0.1)])
 def test_noise_and_walk_are_learned(noise: float, walk: float) -> None:
-    rng, learned = np.random.default_rng(4), WalkNoise(0.05, 0.3, 50.0)
-    values = np.cumsum(walk * math.sqrt(DT_S) * rng.standard_normal(20_000)) + noise * rng.standard_normal(20_000)
-    for value in values.tolist():
-        learned.update(value, DT_S)
-    assert math.sqrt(learned.walk) == pytest.approx(walk, rel=0.35)
-    assert math.sqrt(learned.variance) == pytest.approx(noise, rel=0.35 if walk < 1 else 1.5)
+    levels = NoiseLevels()
+    errors = _follow(levels, noise, walk)
+    assert math.sqrt(levels.reading) == pytest.approx(noise, rel=0.15 if walk <= noise else 0.7)
+    assert math.sqrt(levels.walk) == pytest.approx(walk, rel=0.35)
+    assert 0.85 < float(np.std(errors)) < 1.15
+
+
+def test_a_sensor_that_does_not_lead_says_nothing_of_the_walk() -> None:
+    optics = NoiseLevels()
+    laser = NoiseLevels(optics)
+    for _ in range(1000):
+        laser.learn(2.0, 0.01, DT_S, 0.0)
+    assert (laser.reading > 2, optics.reading, laser.walk) == (True, 1.0, 1.0)
+    optics.learn(2.0, 0.5, DT_S)
+    assert laser.walk == optics.walk != 1.0  # they see the same centre
 
 
 def test_learned_noise_stays_within_its_bounds() -> None:
-    learned = WalkNoise(0.05, 0.3, 50.0)
-    for k in range(20_000):
-        learned.update(1e3 * (k % 2), DT_S)
-    assert learned.variance <= 0.05**2 * 25 * 1.001
-    for _ in range(50_000):
-        learned.update(0.0, DT_S)
-    assert learned.variance >= 0.05**2 / 25 * 0.999
-    assert learned.walk >= 0.3**2 / 900 * 0.999
+    levels = NoiseLevels()
+    for innovation in (1e3, 0.0):
+        for k in range(50_000):
+            levels.learn(innovation * (k % 2), 0.5, DT_S)
+        assert 0.999 / 25 <= levels.reading <= 25 * 1.001
+        assert 0.999 / 900 <= levels.walk <= 900 * 1.001
+
+
+def test_a_ramp_is_found_with_its_begin_and_slope_and_white_noise_is_none() -> None:
+    ramp, noise = Ramp(8.0), np.random.default_rng(3).standard_normal(2000)
+    assert not any(ramp.update(float(value), 0.05 * k) for k, value in enumerate(noise[:1000]))
+    for k, value in enumerate(noise[1000:].tolist()):
+        if ramp.update(value - 0.4 * k, 50.0 + 0.05 * k):
+            break
+    assert k < 9
+    assert ramp.since_s == pytest.approx(50.0, abs=0.2)
+    assert ramp.slope == pytest.approx(-0.4 / 0.05, rel=0.5)
