@@ -17,7 +17,7 @@ import numpy as np
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
-from membrane_ctrl.control.filters import NoiseLevels, Ramp, smoothing
+from membrane_ctrl.control.filters import Level, Ramp, ReadingNoise, configured_walk, smoothing
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -34,8 +34,8 @@ _IMPOSSIBLE = 1e4  # um, Pa or K: no film, weather or mount moves that far in a 
 _UNKNOWN_UM2 = 1e6  # variance of the optics' zero before lock
 _LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the start
 _SHARE_S = 2.0  # memory of the sensors' weights
-# of a leak's ramp, in standard deviations: seldom by chance, for what the laser's noise makes of it is larger
-_RUN = {Sensor.LASER: 14.0, Sensor.OPTICS: 8.0}
+# Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is large
+_RUN = 14.0, 8.0
 _OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
 Rows = tuple[tuple[int, float], ...]  # states and their factors in a reading's expectation
 
@@ -84,11 +84,11 @@ class CentreFilter:
             self._p[i, i] = variance
         self._origin = [math.nan, math.nan, math.nan]  # first pressure, air temperature, sag
         self._watches = [_Watch() for _ in Sensor]
-        self._levels = {sensor: NoiseLevels() for sensor in Sensor}
-        self._levels[Sensor.OPTICS] = NoiseLevels(self._levels[Sensor.LASER])
+        self._noises = [ReadingNoise(stated=sensor == Sensor.OPTICS) for sensor in Sensor]
+        self._walks = [configured_walk() for _ in range(3)]  # of the centre, of the pressure, of the air
+        self._ramps = [Ramp(limit) for limit in _RUN]
         self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
         self._transit.place(flow_um_per_s)
-        self._ramps = {sensor: Ramp(limit) for sensor, limit in _RUN.items()}
         self._jumped: list[str] = []
         self.frames = 0  # of the optics since lock
         self._frame_interval_s = FRESH_S[Sensor.OPTICS]
@@ -200,7 +200,7 @@ class CentreFilter:
         """Use one reading, whose expectation is the sum of states times factors, by how well it fits."""
         taken_s = now_s if math.isnan(taken_s) else taken_s
         watch, x, p = self._watches[sensor], self._x, self._p
-        variance *= self._levels[sensor].reading
+        variance *= self._noises[sensor].factor
         innovation = float(value - sum(factor * x[i] for i, factor in rows))
         if abs(innovation) > _IMPOSSIBLE:
             return
@@ -208,7 +208,7 @@ class CentreFilter:
         squared = innovation**2 / spread
         watch.innovation = innovation / math.sqrt(spread)
         leads = sensor != Sensor.LASER or not self._fresh(Sensor.OPTICS, now_s)
-        ramp = self._ramps.get(sensor) if leads else None
+        ramp = self._ramps[sensor] if leads and sensor <= Sensor.OPTICS else None
         runs = ramp is not None and ramp.update(watch.innovation, taken_s)
         if self._doubted(sensor, squared, taken_s, now_s) and not runs:
             return
@@ -232,25 +232,24 @@ class CentreFilter:
 
     def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
         """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
-        levels, innovation = self._levels, self._watches[sensor].innovation
-        if not leads:
-            levels[sensor].learn(innovation, share, dt_s, 0.0)
-        elif sensor in self._ramps:
+        walks: tuple[tuple[Level, float], ...] = ()
+        if sensor > Sensor.OPTICS:
+            walks = ((self._walks[sensor - 1], 1.0),)
+        elif leads:
             by_air = self._air_walk() * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
-            blame = (own := self._centre_walk()) / (own + by_air)
-            levels[sensor].learn(innovation, share, dt_s, blame, levels[Sensor.THERMOMETER])
-        else:
-            levels[sensor].learn(innovation, share, dt_s)
+            own = (centre := self._centre_walk()) / (centre + by_air)
+            walks = ((self._walks[0], own), (self._walks[2], 1 - own))
+        self._noises[sensor].learn(self._watches[sensor].innovation, share, dt_s, walks)
 
     def _pressure_walk(self) -> float:
-        return self._levels[Sensor.BAROMETER].walk * self._config.pressure_walk_pa_per_root_s**2
+        return self._walks[1].factor * self._config.pressure_walk_pa_per_root_s**2
 
     def _air_walk(self) -> float:
-        return self._levels[Sensor.THERMOMETER].walk * self._config.air_walk_k_per_root_s**2
+        return self._walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
-        return self._levels[Sensor.LASER].walk * (self._config.centre_walk_um_per_root_s**2 + missed)
+        return self._walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
     def _spread(self, rows: Rows, variance: float) -> tuple[FloatArray, float]:
         """Covariance of all states with a reading's expectation, and the variance of its innovation."""

@@ -164,46 +164,42 @@ class Level:
         self._log = min(max(self._log + slope / self._information, -self._bound), self._bound)
 
 
-class NoiseLevels:
-    """Factors on the variances of a sensor's readings and of the walk that it sees.
+def configured_walk() -> Level:
+    """The factor on a configured walk, to be learned."""
+    return Level(_WALK_BOUND, _UNREST)
 
-    The innovations are to be of unit variance, which sets the scale of both, and white, which sets their ratio: they
-    correlate positively where the filter follows too slowly, negatively where it follows noise.
+
+class ReadingNoise:
+    """The factor on the variance of a sensor's readings; corrects the walks that the sensor sees, too.
+
+    The innovations are to be of unit variance, which sets the scale of noise and walks, and white, which sets their
+    ratio: they correlate positively where the filter follows too slowly, negatively where it follows noise.
+    `stated`: the noise comes with each reading.
     """
 
-    def __init__(self, sees: "NoiseLevels | None" = None) -> None:
-        self._reading = Level(_READING_BOUND, _STATED if sees else _CONFIGURED)
-        self._walk = sees._walk if sees else Level(_WALK_BOUND, _UNREST)
+    def __init__(self, stated: bool) -> None:
+        self._level = Level(_READING_BOUND, _STATED if stated else _CONFIGURED)
         self._past = 0.0  # how the past innovations would have moved the state, of unit variance
 
     @property
-    def reading(self) -> float:
-        """Factor on the variance of the readings."""
-        return self._reading.factor
+    def factor(self) -> float:
+        """Present factor."""
+        return self._level.factor
 
-    @property
-    def walk(self) -> float:
-        """Factor on the variance of the walk."""
-        return self._walk.factor
-
-    def learn(
-        self, innovation: float, share: float, dt_s: float, blame: float = 1.0, other: "NoiseLevels | None" = None
-    ) -> None:
+    def learn(self, innovation: float, share: float, dt_s: float, walks: tuple[tuple[Level, float], ...]) -> None:
         """Take an innovation in standard deviations, and the share of its variance that is the state's.
 
-        `blame` is the part of the walk in what moves the state, 0 for a sensor that does not lead; the rest is the
-        `other`'s walk.
+        `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
         """
         forget = min(1.0, dt_s / _MEMORY_S)
         innovation = min(max(innovation, -_LIMIT), _LIMIT)
         size, runs = (innovation**2 - 1) / 2, math.sqrt(share / 8) * innovation * self._past
         known = share / 8
-        leads = other is not None or blame > 0
         by_noise = 1 - share / 2  # change of the innovations' variance with the noise, both as logarithms
-        self._reading.learn(by_noise * size - leads * runs, by_noise**2 / 2 + leads * known, forget)
-        for walk, part in ((self._walk, blame), (other._walk if other else None, 1 - blame)):
-            if walk and part > 0:
-                walk.learn(part * (share / 2 * size + runs), part**2 * (share**2 / 8 + known), forget)
+        leads = bool(walks)
+        self._level.learn(by_noise * size - leads * runs, by_noise**2 / 2 + leads * known, forget)
+        for walk, part in walks:
+            walk.learn(part * (share / 2 * size + runs), part**2 * (share**2 / 8 + known), forget)
         self._past = (1 - share) * self._past + math.sqrt(share * (2 - share)) * innovation
 
 
