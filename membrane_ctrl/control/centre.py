@@ -17,7 +17,7 @@ import numpy as np
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
-from membrane_ctrl.control.filters import Level, Ramp, ReadingNoise, configured_walk, smoothing
+from membrane_ctrl.control.filters import LearnedFactor, Ramp, ReadingNoise, configured_walk, smoothing
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -232,7 +232,7 @@ class CentreFilter:
 
     def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
         """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
-        walks: tuple[tuple[Level, float], ...] = ()
+        walks: tuple[tuple[LearnedFactor, float], ...] = ()
         if sensor > Sensor.OPTICS:
             walks = ((self._walks[sensor - 1], 1.0),)
         elif leads:

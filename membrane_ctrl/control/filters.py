@@ -147,7 +147,7 @@ _SLACK, _STEEPEST, _SHORTEST_S = 0.5, 4.0, 0.02  # of a ramp: two bad readings a
 _STATED, _CONFIGURED, _UNREST = 250.0, 25.0, 4.0
 
 
-class Level:
+class LearnedFactor:
     """A factor on a variance; its logarithm follows the likelihood's slope over the information so far."""
 
     def __init__(self, bound: float, information: float) -> None:
@@ -164,9 +164,9 @@ class Level:
         self._log = min(max(self._log + slope / self._information, -self._bound), self._bound)
 
 
-def configured_walk() -> Level:
+def configured_walk() -> LearnedFactor:
     """The factor on a configured walk, to be learned."""
-    return Level(_WALK_BOUND, _UNREST)
+    return LearnedFactor(_WALK_BOUND, _UNREST)
 
 
 class ReadingNoise:
@@ -178,7 +178,7 @@ class ReadingNoise:
     """
 
     def __init__(self, stated: bool) -> None:
-        self._level = Level(_READING_BOUND, _STATED if stated else _CONFIGURED)
+        self._level = LearnedFactor(_READING_BOUND, _STATED if stated else _CONFIGURED)
         self._past = 0.0  # how the past innovations would have moved the state, of unit variance
 
     @property
@@ -186,7 +186,9 @@ class ReadingNoise:
         """Present factor."""
         return self._level.factor
 
-    def learn(self, innovation: float, share: float, dt_s: float, walks: tuple[tuple[Level, float], ...]) -> None:
+    def learn(
+        self, innovation: float, share: float, dt_s: float, walks: tuple[tuple[LearnedFactor, float], ...]
+    ) -> None:
         """Take an innovation in standard deviations, and the share of its variance that is the state's.
 
         `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
