@@ -22,7 +22,8 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_figure
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, separable
 from membrane_ctrl.metrology.track.scene import scene_of
-from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
+from membrane_ctrl.metrology.track.tracked import TrackedFrame
+from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
 

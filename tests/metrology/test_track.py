@@ -14,7 +14,8 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
+from membrane_ctrl.metrology.track.tracked import TrackedFrame
+from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set

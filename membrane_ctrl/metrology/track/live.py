@@ -16,7 +16,8 @@ from membrane_ctrl.metrology import bins, checked, full, live, phase
 from membrane_ctrl.metrology.frames import evidence, frame_stack
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS
 from membrane_ctrl.metrology.track.scene import scene_of
-from membrane_ctrl.metrology.track.tracker import TrackedFrame, Tracker
+from membrane_ctrl.metrology.track.tracked import TrackedFrame
+from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 

@@ -6,16 +6,16 @@ either: rays meet the screen at other distances, so that micrometres of astigmat
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
+from membrane_ctrl.metrology.track import tracked
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, steadied, stepped
-from membrane_ctrl.metrology.track.guards import Finding, LostOrders, Squares, light_faults
 from membrane_ctrl.metrology.track.scene import CrossedScene
-from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 
 _CONTRAST = 0.4  # of the fringes, against the reference's
@@ -30,67 +30,7 @@ _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
-_STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
 _SIGMA_EVERY = 25  # frames: errors change slowly, and the covariance costs as much as five fits
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Figure of one frame; NaN where it is rejected."""
-
-    time_s: float  # middle of the exposure
-    coeffs_um: FloatArray  # (36,) Noll j = 1..36, the vertex at 0
-    covariance_um2: FloatArray  # (36, 36): of the error against the reference's figure
-    hencky_um: float
-    sag_um: float
-    sag_sigma_um: float
-    verdict: shape_estimate.Verdict
-    reason: str
-    rest_share: float  # what the fit leaves, over the swing of the fringes
-    used_share: float = 0.0  # of the bins, those with weight
-    swing_adu: float = math.nan  # of the fringes, median
-    saturated_share: float = 0.0  # of the bins
-    lost: bool = False  # the mirror may not be where the last good frame left it: a new reference is needed
-
-    @property
-    def sigma_um(self) -> FloatArray:
-        """(36,): 1 sigma against the reference's figure."""
-        return np.sqrt(np.diag(self.covariance_um2))
-
-
-class _Standing:
-    """Means of the frames of one step of the pattern, while the mirror stays about where it is."""
-
-    def __init__(self, shifts_rad: tuple[float, float]) -> None:
-        self.shifts_rad = shifts_rad
-        self.count = 0
-        self.variance_mm2 = np.zeros(surface.PARAMETERS)  # of the mean parameters, once the step is over
-        self._parameters: list[FloatArray] = []  # of the first frame, then of all
-
-    def add(self, seen_adu: Singles, fit: FrameFit) -> None:
-        """Take a frame; the means begin anew where the mirror has left the first one's place."""
-        parameters = fit.surface.parameters
-        if self.count and np.max(np.abs(surface.height_probe() @ (parameters - self._parameters[0]))) > _STANDING_MM:
-            self.count = 0
-        if not self.count:
-            self._seen, self._light = np.zeros(seen_adu.size), np.zeros_like(fit.light)
-            self._left = np.zeros(seen_adu.size)
-            self._parameters = [parameters]
-        self.count += 1
-        self._seen += seen_adu
-        self._light += fit.light
-        self._left += fit.weights * fit.residual_adu
-        self._parameters.append(parameters)
-
-    def seen_adu(self) -> Singles:
-        """Means over the bins (n,)."""
-        return (self._seen / self.count).astype(np.float32)
-
-    def fit(self, radius_mm: float) -> FrameFit:
-        """The mean solution."""
-        shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
-        left = (self._left / self.count).astype(np.float32)
-        return FrameFit(shape, self._light / self.count, left, np.ones_like(left), True)
 
 
 class Tracker:
@@ -125,7 +65,7 @@ class Tracker:
         self._begin(scene, scene.surface)
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
         self._anchor_light = math.nan
-        self._orders = LostOrders(self._fitter)
+        self._orders = tracked.LostOrders(self._fitter)
         self._knocked = ""
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
         self._covariance_um2, self._covariance_age = np.full((36, 36), math.nan), 0
@@ -139,8 +79,8 @@ class Tracker:
         self._last = FrameFit(shape, np.zeros((3, 36)), none, none, True)
         self._scale_adu, self._light = 0.0, math.nan
         self._seen: Singles = none
-        self._squares = Squares(scene)
-        self._steps: list[_Standing] = []
+        self._squares = tracked.Squares(scene)
+        self._steps: list[tracked.StandingFrames] = []
 
     def anchor(
         self, frames: Sequence[Image], shifts_rad: FloatArray, time_s: FloatArray, displacement_um: FloatArray
@@ -169,7 +109,7 @@ class Tracker:
         if any(frame.verdict == "rejected" for frame in found):
             return found
         moved = self._renew(fits, np.stack(seen), shifts_rad)
-        return [_moved(frame, moved, self._last.surface.radius_mm) for frame in found]
+        return [tracked.moved_frame(frame, moved, self._last.surface.radius_mm) for frame in found]
 
     def _renew(self, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray) -> FloatArray:
         """Light, swings and phases of each bin from steps; returns by how much the parameters (36,) move."""
@@ -183,7 +123,7 @@ class Tracker:
     def _remember(self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit) -> None:
         """Add a good frame to its step."""
         if not self._steps or self._steps[-1].shifts_rad != shifts_rad:
-            self._steps = [*self._steps[1 - ENOUGH_STEPS :], _Standing(shifts_rad)]
+            self._steps = [*self._steps[1 - ENOUGH_STEPS :], tracked.StandingFrames(shifts_rad)]
         self._steps[-1].add(seen_adu, fit)
 
     def _take_steps(self, shifts_rad: tuple[float, float]) -> None:
@@ -238,19 +178,19 @@ class Tracker:
         seen = (self._binner.sums[0].ravel()[index] / np.float32(self._binner.bin_px**2)).astype(np.float32)
         same, self._seen = bool(np.array_equal(seen, self._seen)), seen
         if same and not self._blind:
-            return _rejected(time_s, "frozen: the frame is identical to the one before")
+            return tracked.rejected_frame(time_s, "frozen: the frame is identical to the one before")
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
-        faults = [*light_faults(float(np.mean(saturated)), light, covered), *self._light_changes(light)]
+        faults = [*tracked.light_faults(float(np.mean(saturated)), light, covered), *self._light_changes(light)]
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
-            return _rejected(time_s, rejected.reason)
+            return tracked.rejected_frame(time_s, rejected.reason)
         fit = self._fitted(seen, shifts_rad, light, saturated | self._squares.bins(covered), displacement_um)
         rest = self._scale_of(fit) / float(np.median(self._fitter.scene.light_adu[1])) / light
         out = float(np.mean(fit.weights[~saturated & ~self._squares.bins(covered)] == 0))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
         if doubt is not None and doubt.verdict == "rejected":
-            return _rejected(time_s, doubt.reason, rest, doubt.lost)
+            return tracked.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, time_s, displacement_um)
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
@@ -260,7 +200,7 @@ class Tracker:
 
     def missed(self, time_s: float, reason: str) -> TrackedFrame:
         """The result of a frame that could not be read."""
-        return _rejected(time_s, reason)
+        return tracked.rejected_frame(time_s, reason)
 
     def mean_residual_adu(self) -> FloatArray:
         """Light (rows, columns) that the fits left on average, over the bins; NaN outside the mirror."""
@@ -397,22 +337,3 @@ class Tracker:
             covariance = 0.7 * self._covariance_um2 + 0.3 * covariance
             sag_sigma_um = math.sqrt(0.7 * self._sag_sigma_um**2 + 0.3 * sag_sigma_um**2)
         self._covariance_um2, self._sag_sigma_um = covariance, sag_sigma_um
-
-
-def _moved(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
-    """The frame with a change of the surface's parameters."""
-    change = surface.Surface.from_parameters(by_mm, radius_mm)
-    return replace(
-        frame,
-        coeffs_um=frame.coeffs_um + 1e3 * change.coeffs_mm,
-        hencky_um=frame.hencky_um + 1e3 * change.hencky_mm,
-        sag_um=frame.sag_um + 1e3 * change.sag_mm,
-    )
-
-
-_NONE, _NO_COVARIANCE = np.full(36, math.nan), np.full((36, 36), math.nan)
-
-
-def _rejected(time_s: float, reason: str, rest: float = math.nan, lost: bool = False) -> TrackedFrame:
-    nan = math.nan
-    return TrackedFrame(time_s, _NONE, _NO_COVARIANCE, nan, nan, nan, "rejected", reason, rest, lost=lost)

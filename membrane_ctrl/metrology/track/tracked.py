@@ -1,11 +1,12 @@
-"""What the light of a frame says before any fit, and whether a change of shape can be a film's."""
+"""A tracked frame: its figure, faults that its light shows, whether its change can be a film's, the mean of many."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
-from membrane_ctrl.metrology.track.fit import FrameFitter, squares
+from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, squares
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Singles
@@ -14,6 +15,83 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, Singles
 _COVERED = 0.25
 _COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
 _DARK = 0.3  # of the reference's light
+_STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
+_NONE, _NO_COVARIANCE = np.full(36, math.nan), np.full((36, 36), math.nan)
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Figure of one frame; NaN where it is rejected."""
+
+    time_s: float  # middle of the exposure
+    coeffs_um: FloatArray  # (36,) Noll j = 1..36, the vertex at 0
+    covariance_um2: FloatArray  # (36, 36): of the error against the reference's figure
+    hencky_um: float
+    sag_um: float
+    sag_sigma_um: float
+    verdict: shape_estimate.Verdict
+    reason: str
+    rest_share: float  # what the fit leaves, over the swing of the fringes
+    used_share: float = 0.0  # of the bins, those with weight
+    swing_adu: float = math.nan  # of the fringes, median
+    saturated_share: float = 0.0  # of the bins
+    lost: bool = False  # the mirror may not be where the last good frame left it: a new reference is needed
+
+    @property
+    def sigma_um(self) -> FloatArray:
+        """(36,): 1 sigma against the reference's figure."""
+        return np.sqrt(np.diag(self.covariance_um2))
+
+
+def moved_frame(frame: TrackedFrame, by_mm: FloatArray, radius_mm: float) -> TrackedFrame:
+    """The frame with a change of the surface's parameters."""
+    change = surface.Surface.from_parameters(by_mm, radius_mm)
+    return replace(
+        frame,
+        coeffs_um=frame.coeffs_um + 1e3 * change.coeffs_mm,
+        hencky_um=frame.hencky_um + 1e3 * change.hencky_mm,
+        sag_um=frame.sag_um + 1e3 * change.sag_mm,
+    )
+
+
+def rejected_frame(time_s: float, reason: str, rest: float = math.nan, lost: bool = False) -> TrackedFrame:
+    nan = math.nan
+    return TrackedFrame(time_s, _NONE, _NO_COVARIANCE, nan, nan, nan, "rejected", reason, rest, lost=lost)
+
+
+class StandingFrames:
+    """Means of the frames of one step of the pattern, while the mirror stays about where it is."""
+
+    def __init__(self, shifts_rad: tuple[float, float]) -> None:
+        self.shifts_rad = shifts_rad
+        self.count = 0
+        self.variance_mm2 = np.zeros(surface.PARAMETERS)  # of the mean parameters, once the step is over
+        self._parameters: list[FloatArray] = []  # of the first frame, then of all
+
+    def add(self, seen_adu: Singles, fit: FrameFit) -> None:
+        """Take a frame; the means begin anew where the mirror has left the first one's place."""
+        parameters = fit.surface.parameters
+        if self.count and np.max(np.abs(surface.height_probe() @ (parameters - self._parameters[0]))) > _STANDING_MM:
+            self.count = 0
+        if not self.count:
+            self._seen, self._light = np.zeros(seen_adu.size), np.zeros_like(fit.light)
+            self._left = np.zeros(seen_adu.size)
+            self._parameters = [parameters]
+        self.count += 1
+        self._seen += seen_adu
+        self._light += fit.light
+        self._left += fit.weights * fit.residual_adu
+        self._parameters.append(parameters)
+
+    def seen_adu(self) -> Singles:
+        """Means over the bins (n,)."""
+        return (self._seen / self.count).astype(np.float32)
+
+    def fit(self, radius_mm: float) -> FrameFit:
+        """The mean solution."""
+        shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
+        left = (self._left / self.count).astype(np.float32)
+        return FrameFit(shape, self._light / self.count, left, np.ones_like(left), True)
 
 
 @dataclass(frozen=True)
