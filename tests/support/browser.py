@@ -17,7 +17,7 @@ from tornado.httpclient import AsyncHTTPClient
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-_PATIENCE_S = 60.0  # a busy machine starts a browser in ten
+_PATIENCE_S = 180.0  # a page that hangs; with a thirtieth of a core, steps have taken more than 60
 _LOOK_S = 0.1
 _FIND = """function find(root, label) {
   for (const element of root.querySelectorAll("*")) {

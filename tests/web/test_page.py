@@ -26,7 +26,7 @@ from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import CHROMIUM, Tab, browser_tab
 
-_START_S = 60.0
+_START_S = 180.0
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 
 
