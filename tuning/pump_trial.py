@@ -11,7 +11,7 @@ from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
-from tuning.identification import characterise, identify, loop_model, pump_curve, pump_survey
+from tuning.identification import characterise, identify, loop_model, pump_curve, pump_map, pump_survey
 from tuning.rig import HoldRig
 
 _MAP_S = 3600.0
@@ -29,7 +29,7 @@ _CURVE_OFF = 0.2  # of k; the margins tolerate more
 class MappedPump:
     """`pump_map.json`: what was measured and applied, and what the pump was taken for before."""
 
-    found: pump_survey.PumpMap
+    found: pump_map.PumpMap
     before: schema.PumpConfig
     gain: float  # of the mirror on the curve, from steps of the flow: 1
     gain_sigma: float
@@ -74,7 +74,7 @@ def map_pump(
     return done, session
 
 
-def _surveyed(rig: HoldRig, limit_um: float) -> pump_survey.PumpMap:
+def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     _returned(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     curve = gas.PumpCurve(rig.pump)
@@ -103,7 +103,7 @@ def _freed(loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.Pump
     return loop.model_copy(update={"flow_max_um_per_s": most_um_per_s})
 
 
-def _safe(loop: schema.LoopConfig, found: pump_survey.PumpMap) -> schema.LoopConfig:
+def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig:
     """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this actuator."""
     model = loop_model.PlantModel(1.0, found.delay_s, found.lag_s, found.leak_um_per_s)
     margins = loop_model.margins(loop_model.Gains.of(loop), model, 1 / loop.rate_hz)

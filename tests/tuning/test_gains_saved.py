@@ -14,7 +14,7 @@ from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
 from tuning import choice
 from tuning.gains_file import What, entries, entry, note
-from tuning.identification.pump_survey import PumpMap
+from tuning.identification.pump_map import PumpMap
 from tuning.pump_trial import MappedPump
 from tuning.session import Verified
 

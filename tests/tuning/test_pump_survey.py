@@ -22,7 +22,8 @@ from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
 from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit
-from tuning.identification.pump_survey import PumpMap, PumpSurvey
+from tuning.identification.pump_map import PumpMap
+from tuning.identification.pump_survey import PumpSurvey
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig
 
@@ -175,11 +176,11 @@ def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: 
 def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
     said = "rises from 0.1 um/s at a command of 0.25 to 17.0 um/s at 0.35, and the mirror loses 1.8 um/s"
     with pytest.raises(ValueError, match=said):
-        survey_of([0.25, 0.35], [0.1, 17.0], 1.8)._known_part()
+        survey_of([0.25, 0.35], [0.1, 17.0], 1.8).result()
     with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # what is between may hold it
-        survey_of([0.25, 0.55], [0.1, 17.0], 1.8)._known_part()
+        survey_of([0.25, 0.55], [0.1, 17.0], 1.8).result()
     with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # a hold at 4.5 is possible
-        survey_of([0.25, 0.35], [0.1, 17.0], 4.5)._known_part()
+        survey_of([0.25, 0.35], [0.1, 17.0], 4.5).result()
 
 
 @pytest.mark.parametrize(("leak", "delay_s", "least_um"), [(2.4, 1.9, -2.7), (0.5, 0.1, -7.4), (6.0, 1.9, 0.0)])

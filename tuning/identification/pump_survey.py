@@ -1,4 +1,4 @@
-"""Which commands to give next, until the pump's curve is known, and the curve they say.
+"""Which commands to give next, until the pump's curve is known.
 
 A round is a minute or two of short runs, each from below the centre to above it or back; the hold between two rounds
 brings the mirror back. What is known so far says how long a command may last. Levels are added where the curve bends
@@ -11,20 +11,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM, PumpStep
+from membrane_ctrl.control.experiments.trial import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, PumpRun, fit, smoothed
+from tuning.identification.pump_map import JUMP_SHARE, NO_BRANCH, PumpMap, Surveyed, first_jump, stuck
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
-_USEFUL_SHARE = 0.02  # beyond it there is no curve
-_STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
-_REACHES_LEAKS = 1.2
 _BENT_SHARE = 0.035  # of the full flow, by which a kink between two levels may be hidden
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
-_NONE_SHARE, _JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
-_EDGE, _EDGE_MOST, _NEAREST = 0.02, 0.1, 0.04  # commands between which a jump lies, at worst; levels for a bend
-_STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
+_EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
@@ -37,21 +32,6 @@ _ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
 _FIRST_ROUNDS = 5  # without any flow
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
-
-
-@dataclass(frozen=True, slots=True)
-class PumpMap:
-    """`pump_map.json`: what was measured. Flows in um/s."""
-
-    fraction: tuple[float, ...]  # levels reached from below
-    flow_um_per_s: tuple[float, ...]
-    sigma_um_per_s: tuple[float, ...]
-    pump: PumpConfig
-    leak_um_per_s: float
-    delay_s: float
-    lag_s: float
-    duration_s: float
-    known: bool  # every level to the accuracy wanted
 
 
 @dataclass
@@ -98,7 +78,9 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if not self._sure()[1].any():
-            if self._rounds >= (_FIRST_ROUNDS if self._stuck() else 3 * _FIRST_ROUNDS):
+            if self._rounds >= (
+                _FIRST_ROUNDS if stuck(self.fit, self._branches.get(True, NO_BRANCH)) else 3 * _FIRST_ROUNDS
+            ):
                 return ()
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
             rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
@@ -155,7 +137,7 @@ class PumpSurvey:
         noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
         weights = 1 / np.diag(noise)
         rising_flows = np.asarray(isotonic_regression(flows, weights=weights).x)
-        jump = _jump(Branch(fractions, rising_flows, weights**-0.5), self.full_um_per_s)
+        jump = first_jump(Branch(fractions, rising_flows, weights**-0.5), self.full_um_per_s)
         first = int(np.searchsorted(fractions, jump[1])) if jump is not None else 0
         flows[:first] = rising_flows[:first]
         flows[first:], noise[first:, first:] = smoothed(fractions[first:], flows[first:], noise[first:, first:])
@@ -164,7 +146,7 @@ class PumpSurvey:
 
     def start(self) -> tuple[float, float] | None:
         """The command at which a standing pump starts with a flow at once, and the one below it, if it does."""
-        return _jump(self._branches[True], self.full_um_per_s)
+        return first_jump(self._branches[True], self.full_um_per_s)
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
@@ -205,7 +187,7 @@ class PumpSurvey:
         found: list[float] = []
         for i, (low, high) in enumerate(pairwise(fractions.tolist())):
             clear = flows[i + 1] - flows[i] > 4 * math.hypot(sigmas[i], sigmas[i + 1])
-            if clear and flows[i] < 0.02 * full and flows[i + 1] > _JUMP_SHARE * full and high - low > _EDGE:
+            if clear and flows[i] < 0.02 * full and flows[i + 1] > JUMP_SHARE * full and high - low > _EDGE:
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
@@ -303,122 +285,21 @@ class PumpSurvey:
         """A larger command, from which a level is reached: beyond any hysteresis."""
         return min(1.0, level.fraction + _ABOVE)
 
+    def result(self) -> PumpMap:
+        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
+        return self._surveyed().map()
+
+    def _surveyed(self) -> Surveyed:
+        return Surveyed(
+            self.fit, self._branches.get(True, NO_BRANCH), self._branches.get(False, NO_BRANCH), self.full_um_per_s,
+            bool(self._branches) and self.hysteretic(), self.duration_s, self.done, self.limit_um,
+        )  # fmt: skip
+
     def _up(self) -> float:
         """The smallest known command that lifts the mirror well; the largest if none does."""
         fractions, flows, sigmas = self._branches[True].columns
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         return float(lifts[0] if lifts.size else fractions[-1])
-
-    def result(self) -> PumpMap:
-        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
-        from scipy.optimize import isotonic_regression
-
-        rising, from_bottom = self._known_part()
-        leak, full = self.fit.leak_um_per_s, float(rising.flows[-1])
-        if full < leak:
-            raise ValueError(
-                f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
-                "take a stronger pump, then run `tune pump` again"
-            )
-        start, above = _jump(rising, full), self._branches[False].columns
-        begin = stall = 0.0 if from_bottom else float(rising.fractions[0])
-        if start is not None:
-            begin = stall = start[1]
-            stalls = _jump(self._branches[False], full)
-            stall = min(begin, stalls[1]) if stalls is not None else begin
-        falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
-        up = {f: v for f, v in zip(rising.fractions.tolist(), rising.flows.tolist(), strict=True) if f >= begin}
-        points = sorted({**falling, **up}.items())
-        while len(points) > 2 and points[1][1] <= 0.005 * full:
-            points.pop(0)
-        while len(points) > 2 and points[-2][1] >= 0.995 * full:
-            points.pop()
-        xs, ys = np.array(points).T
-        table: dict[str, object] = {"curve_fraction": _tuple(xs), "curve_um_per_s": _tuple(isotonic_regression(ys).x)}
-        if self.hysteretic():
-            more = np.maximum(np.interp(xs, above[0], above[1]), isotonic_regression(ys).x)
-            more[-1] = ys[-1]
-            table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
-        pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
-        return PumpMap(
-            _tuple(rising.fractions), _tuple(rising.flows), _tuple(rising.sigmas),
-            pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
-        )  # fmt: skip
-
-    def _stuck(self) -> bool:
-        """Whether no command so far gives what would matter, beyond doubt."""
-        # a pump that is stuck at what leaks makes the mirror look tight
-        matters_um_per_s = max(_STUCK_LEAKS * self.fit.leak_um_per_s, _STUCK_UM_PER_S)
-        if not self.runs or any(at.flow_um_per_s > 5 * at.sigma_um_per_s for at in self.fit.levels.values()):
-            return False
-        _, flows, sigmas = (column[1:] for column in self._branches[True].columns)
-        return bool((flows + 3 * sigmas < matters_um_per_s).all())
-
-    @property
-    def _further(self) -> str:
-        """What makes the flows known better: runs twice as long see twice the way."""
-        limit_um = min(2 * self.limit_um, LIMIT_MAX_UM)
-        if limit_um > self.limit_um:
-            return f"run `tune pump` again with --limit-um {limit_um:g}"
-        return "run `tune pump` again in steadier weather, or with a quieter laser"
-
-    def _known_part(self) -> tuple[Branch, bool]:
-        """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
-
-        Beyond them nothing is said. Raises ValueError if there are none.
-        """
-        if not self.fit.levels:
-            raise ValueError(f"the experiments were stopped too early: {self._further}")
-        fractions, flows, sigmas = self._branches[True].columns
-        leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
-        if self._stuck():
-            raise ValueError(
-                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} um/s more at "
-                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
-                "`tune pump` again"
-            )
-        known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
-        low = top = int(np.argmin(np.where(known, np.abs(flows - _REACHES_LEAKS * leak), np.inf)))
-        while low > 0 and known[low - 1]:
-            low -= 1
-        while top + 1 < known.size and known[top + 1]:
-            top += 1
-        beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
-        if beyond:
-            self._refuse_step()
-        if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
-            raise ValueError(
-                f"the flow {'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f} is "
-                f"not known to {_USEFUL_SHARE:.0%} after {self.duration_s / 60:.0f} minutes of experiments: "
-                f"{self._further}"
-            )
-        part = slice(low, top + 1)
-        return Branch(fractions[part], flows[part], sigmas[part]), low == 0
-
-    def _refuse_step(self) -> None:
-        """Raises ValueError if the flow rises at once from less than the leak to several times as much."""
-        fractions, flows, sigmas = self._branches[True].columns
-        leak = self.fit.leak_um_per_s
-        above = int(np.argmax(flows - 2 * sigmas > _STEP_LEAKS * leak))
-        below = above - 1
-        if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
-            raise ValueError(
-                f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
-                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: "
-                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run "
-                "`tune pump` again"
-            )
-
-
-def _jump(branch: Branch, full: float) -> tuple[float, float] | None:
-    """Commands just below and at the first clear flow, if that is a jump."""
-    fractions, flows, sigmas = branch.columns
-    clear = np.flatnonzero(flows - 2 * sigmas > _NONE_SHARE * full)
-    if not clear.size or not clear[0]:
-        return None
-    low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
-    before, after = flows[clear[0] - 1 : clear[0] + 1] / full
-    return (low, high) if before < _NONE_SHARE and after > _JUMP_SHARE and high - low <= _EDGE_MOST else None
 
 
 def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
@@ -439,7 +320,3 @@ def _for(fraction: float, duration_s: float, until_um: float | None = None) -> P
 
 def _rounded(fraction: float) -> float:
     return round(fraction, 3)
-
-
-def _tuple(values: FloatArray) -> tuple[float, ...]:
-    return tuple(round(value, 4) for value in values.tolist())

@@ -1,0 +1,163 @@
+"""The curve that a survey of the pump says, or why there is none to hold a mirror with."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM
+from membrane_ctrl.model.arrays import FloatArray
+from tuning.identification.pump_curve import Branch, PumpFit
+
+_USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it there is no curve
+_STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
+_REACHES_LEAKS = 1.2
+_STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
+_NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
+_EDGE_MOST = 0.1  # between the commands of a jump
+NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
+class PumpMap:
+    """`pump_map.json`: what was measured. Flows in um/s."""
+
+    fraction: tuple[float, ...]  # levels reached from below
+    flow_um_per_s: tuple[float, ...]
+    sigma_um_per_s: tuple[float, ...]
+    pump: PumpConfig
+    leak_um_per_s: float
+    delay_s: float
+    lag_s: float
+    duration_s: float
+    known: bool  # every level to the accuracy wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Surveyed:
+    """What a survey has found so far. Flows in um/s."""
+
+    fit: PumpFit
+    rising: Branch  # levels reached from below, from no flow at command 0
+    falling: Branch
+    full_um_per_s: float  # the largest flow seen for certain
+    hysteretic: bool
+    duration_s: float
+    done: bool  # every level to the accuracy wanted
+    limit_um: float
+
+    def map(self) -> PumpMap:
+        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
+        from scipy.optimize import isotonic_regression
+
+        rising, from_bottom = self._known_part()
+        leak, full = self.fit.leak_um_per_s, float(rising.flows[-1])
+        if full < leak:
+            raise ValueError(
+                f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
+                "take a stronger pump, then run `tune pump` again"
+            )
+        start, above = first_jump(rising, full), self.falling.columns
+        begin = stall = 0.0 if from_bottom else float(rising.fractions[0])
+        if start is not None:
+            begin = stall = start[1]
+            stalls = first_jump(self.falling, full)
+            stall = min(begin, stalls[1]) if stalls is not None else begin
+        falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
+        up = {f: v for f, v in zip(rising.fractions.tolist(), rising.flows.tolist(), strict=True) if f >= begin}
+        points = sorted({**falling, **up}.items())
+        while len(points) > 2 and points[1][1] <= 0.005 * full:
+            points.pop(0)
+        while len(points) > 2 and points[-2][1] >= 0.995 * full:
+            points.pop()
+        xs, ys = np.array(points).T
+        table: dict[str, object] = {"curve_fraction": _tuple(xs), "curve_um_per_s": _tuple(isotonic_regression(ys).x)}
+        if self.hysteretic:
+            more = np.maximum(np.interp(xs, above[0], above[1]), isotonic_regression(ys).x)
+            more[-1] = ys[-1]
+            table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
+        pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
+        return PumpMap(
+            _tuple(rising.fractions), _tuple(rising.flows), _tuple(rising.sigmas),
+            pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
+        )  # fmt: skip
+
+    @property
+    def _further(self) -> str:
+        """What makes the flows known better: runs twice as long see twice the way."""
+        limit_um = min(2 * self.limit_um, LIMIT_MAX_UM)
+        if limit_um > self.limit_um:
+            return f"run `tune pump` again with --limit-um {limit_um:g}"
+        return "run `tune pump` again in steadier weather, or with a quieter laser"
+
+    def _known_part(self) -> tuple[Branch, bool]:
+        """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
+
+        Beyond them nothing is said. Raises ValueError if there are none.
+        """
+        if not self.fit.levels:
+            raise ValueError(f"the experiments were stopped too early: {self._further}")
+        fractions, flows, sigmas = self.rising.columns
+        leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
+        if stuck(self.fit, self.rising):
+            raise ValueError(
+                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} um/s more at "
+                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
+                "`tune pump` again"
+            )
+        known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
+        low = top = int(np.argmin(np.where(known, np.abs(flows - _REACHES_LEAKS * leak), np.inf)))
+        while low > 0 and known[low - 1]:
+            low -= 1
+        while top + 1 < known.size and known[top + 1]:
+            top += 1
+        beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
+        if beyond:
+            self._refuse_step()
+        if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
+            raise ValueError(
+                f"the flow {'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f} is "
+                f"not known to {_USEFUL_SHARE:.0%} after {self.duration_s / 60:.0f} minutes of experiments: "
+                f"{self._further}"
+            )
+        part = slice(low, top + 1)
+        return Branch(fractions[part], flows[part], sigmas[part]), low == 0
+
+    def _refuse_step(self) -> None:
+        """Raises ValueError if the flow rises at once from less than the leak to several times as much."""
+        fractions, flows, sigmas = self.rising.columns
+        leak = self.fit.leak_um_per_s
+        above = int(np.argmax(flows - 2 * sigmas > _STEP_LEAKS * leak))
+        below = above - 1
+        if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
+            raise ValueError(
+                f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
+                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: "
+                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run "
+                "`tune pump` again"
+            )
+
+
+def stuck(fit: PumpFit, rising: Branch) -> bool:
+    """Whether no command so far gives what would matter, beyond doubt."""
+    # a pump that is stuck at what leaks makes the mirror look tight
+    matters_um_per_s = max(_STUCK_LEAKS * fit.leak_um_per_s, _STUCK_UM_PER_S)
+    if not rising.flows.size or any(at.flow_um_per_s > 5 * at.sigma_um_per_s for at in fit.levels.values()):
+        return False
+    _, flows, sigmas = (column[1:] for column in rising.columns)
+    return bool((flows + 3 * sigmas < matters_um_per_s).all())
+
+
+def first_jump(branch: Branch, full: float) -> tuple[float, float] | None:
+    """Commands just below and at the first clear flow, if that is a jump."""
+    fractions, flows, sigmas = branch.columns
+    clear = np.flatnonzero(flows - 2 * sigmas > _NONE_SHARE * full)
+    if not clear.size or not clear[0]:
+        return None
+    low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
+    before, after = flows[clear[0] - 1 : clear[0] + 1] / full
+    return (low, high) if before < _NONE_SHARE and after > JUMP_SHARE and high - low <= _EDGE_MOST else None
+
+
+def _tuple(values: FloatArray) -> tuple[float, ...]:
+    return tuple(round(value, 4) for value in values.tolist())
