@@ -19,12 +19,34 @@ _OPTIONS: dict[str, Any] = {
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
-    return njit(**_OPTIONS)(function)
+    return _recompiled_if_unreadable(njit(**_OPTIONS)(function))
 
 
 def step(function: Callable[..., Any]) -> Any:
     """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no vector units."""
-    return njit(forceinline=True, **_OPTIONS)(function)
+    return _recompiled_if_unreadable(njit(forceinline=True, **_OPTIONS)(function))
+
+
+def _recompiled_if_unreadable(dispatcher: Any) -> Any:
+    """Let an index of the cache that cannot be read count as empty; Numba raises.
+
+    It names the classes of arguments by their modules, which the version that wrote it may have had elsewhere, and it
+    may have been cut by a power failure.
+    """
+    file = getattr(dispatcher._cache, "_cache_file", None)  # None where no folder is writable
+    if file is not None:
+        load = file._load_index
+
+        def load_index() -> dict[Any, str]:
+            try:
+                return dict(load())
+            except OSError:
+                raise
+            except Exception:
+                return {}
+
+        file._load_index = load_index
+    return dispatcher
 
 
 # Two threads of our own for kernels that release the interpreter lock.
