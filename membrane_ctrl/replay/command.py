@@ -77,7 +77,7 @@ def open_run(folder: Path) -> RecordedRun:
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
     told_until_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
-    config = toml_file.load(folder / "config.toml", Config, follow=False)
+    config = run_folder.exact_config(folder)
     right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)

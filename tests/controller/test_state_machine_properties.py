@@ -44,9 +44,9 @@ readings = st.builds(
 steady = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, math.inf, 0.0, 1, 0.0, False, 0)
 commands = st.builds(
     Command,
-    kind=st.sampled_from([*sorted(set(TABLE) - {"tune"}), "manual", "hold", "setpoint", "ack"]),
+    kind=st.sampled_from([*sorted(set(TABLE) - {"tune"}), "manual", "manual", "manual", "hold", "setpoint", "ack"]),
     who=st.just("hypothesis"),
-    value=st.one_of(st.floats(0, 5), st.floats(-20, 20), anything),
+    value=st.one_of(st.floats(0, 5), st.floats(0, 5), st.floats(-20, 20), anything),
     text=st.sampled_from(["", "x"]),
     loop=st.sampled_from([None, CONFIG.loop]),
 )

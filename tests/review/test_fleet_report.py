@@ -40,7 +40,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without pictures, which take seconds."""
     for module in (fleet, html):
-        monkeypatch.setattr(module, "render", lambda analysis, *_: f"page of {analysis.run.name}")
+        monkeypatch.setattr(module, "render", lambda analysis, *_, **__: f"page of {analysis.run.name}")
 
 
 def table_of(out: Path) -> dict[str, dict[str, Any]]:
@@ -166,3 +166,9 @@ def test_processes_and_a_cluster_write_the_same_bytes(lab: Path, tmp_path: Path)
         assert cluster.stdin is not None
         cluster.stdin.close()
     assert there == here
+
+
+def test_a_fleet_of_nothing_is_a_line_for_each(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(["report", "--fleet", str(lab / "empty"), str(lab / "missing")]) == Exit.BAD_INPUT
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1].strip().rsplit("/")[-1] for line in said] == ["empty", "missing"]

@@ -160,7 +160,7 @@ _OWN = {
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
     "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/sockets.py",
-    "sessions/folder.py",
+    "sessions/folder.py", "sessions/live_log.py", "web/panels.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",

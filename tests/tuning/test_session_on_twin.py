@@ -209,7 +209,7 @@ def test_a_picture_is_drawn_anew_when_what_it_shows_is(
     elif renewed is not None:
         os.utime(done.file(renewed), ns=(10**18, 2 * 10**18))  # at the same moment: which was first is not known
     seen: set[str] = set()
-    monkeypatch.setattr(report, "_save", lambda path, figure: seen.add(path.name))
+    monkeypatch.setattr(report, "write_figure", lambda path, figure, dpi: seen.add(path.name))
     report.draw(done)
     assert seen == drawn
 

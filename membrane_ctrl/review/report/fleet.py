@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import partial
 from html import escape
@@ -16,7 +16,7 @@ from membrane_ctrl.processes.child import results_of
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
 from membrane_ctrl.review.report.html import html_page, html_table, render, write_report
-from membrane_ctrl.review.report.json import report_table
+from membrane_ctrl.review.report.json import pump_history, report_table
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.run_files.run import open_run
 
@@ -56,9 +56,10 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
     try:
         run = open_run(folder)
         analysis = analyse(run, *part_s(run.origin_utc, start, end))
-        table = report_table(analysis)
+        history = pump_history(folder)
+        table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
         text, curve = plain_json.dumps(table, indent=1), sparkline(analysis.level["mean_error_um"])
-        return RunReport(_line(analysis, table), text, render(analysis), curve)
+        return RunReport(_line(analysis, table), text, render(analysis, history=history), curve)
     except errors.CommandError as error:
         return RunReport({"problem": "; ".join(error.lines).removeprefix(f"{folder}: ")})
     except Exception as error:  # one strange folder must not end the reports of the others
@@ -116,7 +117,7 @@ def fleet_command(options: FleetOptions) -> int:
             lines.append(line)
             rows.append(_row(line, report.curve))
         if all("problem" in line for line in lines):
-            raise errors.InputError(*(f"{line['name']}: {line['problem']}" for line in lines))
+            raise errors.FindingsError([f"{line['name']}: {line['problem']}" for line in lines])
         text = plain_json.dumps({"schema": SCHEMA, "runs": lines}, indent=1)
         files.make_folder(out)
         files.write_text_atomic(out / "fleet.json", text + "\n")
