@@ -16,20 +16,11 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run
+from tests.support.dask_cluster import PATIENT, cluster
 
 pytestmark = pytest.mark.campaign
 SAME = 1e-12
 QUIET_S = 120.0  # a process that used no processor for so long hangs
-CLUSTER = """
-import sys
-from distributed import LocalCluster
-if __name__ == "__main__":
-    local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
-        print(cluster.scheduler_address, flush=True)
-        sys.stdin.read()
-"""
-PATIENT = {f"DASK_DISTRIBUTED__COMM__TIMEOUTS__{name}": "900s" for name in ("CONNECT", "TCP")}
 
 
 def processor_s(process: subprocess.Popen[str]) -> int:
@@ -72,17 +63,10 @@ def numbers(table: Any) -> list[float]:
 
 
 def test_two_workers_give_the_same_figures(tmp_path: Path) -> None:
-    pytest.importorskip("distributed", exc_type=ImportError)
-    folder, script = tmp_path / "set", tmp_path / "cluster.py"
-    script.write_text(CLUSTER)
+    folder = tmp_path / "set"
     assert run(["simulate", str(folder), "--shrink", "12"]) == 0
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, script], text=True, env=os.environ | PATIENT, **pipes) as cluster:
-        assert cluster.stdout is not None
-        address = cluster.stdout.readline().strip()
+    with cluster(tmp_path) as address:
         there = figures(folder, tmp_path / "there", "--scheduler", address)
-        assert cluster.stdin is not None
-        cluster.stdin.close()
     here = figures(folder, tmp_path / "here", "--workers", "1")
     assert there.keys() == here.keys()
     assert numbers(there) == pytest.approx(numbers(here), rel=SAME)

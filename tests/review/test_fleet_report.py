@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -14,6 +15,7 @@ import pytest
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.review.report import fleet, html
+from tests.support.dask_cluster import PATIENT, cluster
 from tests.support.review_runs import written
 
 NAMES = ("20261121T180000Z-one", "20261122T180000Z-two")
@@ -129,24 +131,13 @@ def test_what_cannot_be_asked(
     assert not (lab / "fleet").exists()
 
 
-CLUSTER = """
-import sys
-from distributed import LocalCluster
-if __name__ == "__main__":
-    local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
-        print(cluster.scheduler_address, flush=True)
-        sys.stdin.read()
-"""
-
-
 def files_of(out: Path) -> dict[str, bytes]:
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
 
 
 def reported(lab: Path, out: Path, *more: str) -> dict[str, bytes]:
     words = ["report", "--fleet", str(lab / "north"), str(lab / "south"), "--out", str(out), *more]
-    subprocess.run([sys.executable, "-m", "membrane_ctrl", *words], check=True)
+    subprocess.run([sys.executable, "-m", "membrane_ctrl", *words], check=True, env=os.environ | PATIENT)
     return files_of(out)
 
 
@@ -155,16 +146,8 @@ def test_processes_and_a_cluster_write_the_same_bytes(lab: Path, tmp_path: Path)
     here = reported(lab, tmp_path / "here", "--workers", "1")
     assert len(here) == 6
     assert reported(lab, tmp_path / "two", "--workers", "2") == here
-    pytest.importorskip("distributed", exc_type=ImportError)
-    script = tmp_path / "cluster.py"
-    script.write_text(CLUSTER)
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, script], text=True, **pipes) as cluster:
-        assert cluster.stdout is not None
-        address = cluster.stdout.readline().strip()
+    with cluster(tmp_path) as address:
         there = reported(lab, tmp_path / "there", "--scheduler", address)
-        assert cluster.stdin is not None
-        cluster.stdin.close()
     assert there == here
 
 
