@@ -24,6 +24,7 @@ from firmware_iface import roles
 T = TypeVar("T")
 WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
 NO_ANSWER = 0xFFFF  # displacement_quality when the sensor itself does not answer; no instrument's code
+_ANY = (-math.inf, math.inf)
 _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the longer back-off
 
 
@@ -31,7 +32,7 @@ _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the l
 class RoleDevices:
     """Which device fills which role; None where the bench has none."""
 
-    displacement: roles.DisplacementSensor
+    displacement: roles.DisplacementSensor | None
     pump: roles.Pump
     gauge_pressure: roles.PressureSensor
     vent: roles.Vent | None = None
@@ -93,7 +94,9 @@ class RoleBench:
             0,
             firmware,
             self._watchdog_s,
-            displacement_range_um=self.identities["displacement"].shows,
+            displacement_range_um=self.identities["displacement"].shows
+            if "displacement" in self.identities
+            else _ANY,
             gauge_range_pa=self.identities["gauge_pressure"].shows,
         )
 
@@ -183,11 +186,14 @@ class RoleBench:
 
     async def _sample(self) -> roles.DisplacementSample:
         """The newest sample; without one, the last counter and time, which then do not advance."""
-        last = self._last_sample
+        last, laser = self._last_sample, self._devices.displacement
+        if laser is None:  # the other sensors' answers count
+            self._last_sample = replace(last, sample_counter=last.sample_counter + 1, device_time_s=self._clock())
+            return self._last_sample
         self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
         if "displacement" not in self._tasks:
             try:
-                self._last_sample = await answer("displacement", self._devices.displacement.displacement())
+                self._last_sample = await answer("displacement", laser.displacement())
             except roles.LinkError as error:
                 self._failed("displacement", error)
         return self._last_sample

@@ -92,12 +92,12 @@ def _probed(config: Config) -> list[DeviceProbe]:
             stack.enter_context(bench.locked(bench.device_names(devices)))
         except errors.DeviceError as error:
             return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))]
-        return asyncio.run(_probes(devices)) + probe_optics(config)
+        return asyncio.run(_probes(devices, not config.by_optics)) + probe_optics(config)
 
 
-async def _probes(devices: DevicesConfig) -> list[DeviceProbe]:
+async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
     if devices.board is not None:
-        return [await probe_board(bench.pump_board(devices, devices.board), devices.board)]
+        return [await probe_board(bench.pump_board(devices, devices.board), devices.board, laser)]
     return await probe_roles(bench.role_devices(devices))
 
 
@@ -175,8 +175,11 @@ def _geometry(config: Config) -> str:
     return f"{origin.file} (hash {origin.hash}{made})"
 
 
-async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:
-    """Probe the board, whoever controls it, without writing: claim and watchdog are unaffected."""
+async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> DeviceProbe:
+    """Probe the board, whoever controls it, without writing: claim and watchdog are unaffected.
+
+    `laser`: whether the bench must have one.
+    """
     try:
         identity = await board.identify()
         reading, p50_ms, p99_ms = await _timed(board.read)
@@ -185,7 +188,7 @@ async def probe_board(board: PumpBoard, name: str) -> DeviceProbe:
     finally:
         await board.close()
     who = f"{identity.kind} {identity.firmware}, map {identity.map_version}"
-    said, problem = _board_reading(reading), _board_problem(reading)
+    said, problem = _board_reading(reading), _board_problem(reading, laser)
     notes = NO_CLAIM if identity.map_version == 1 else ""
     return DeviceProbe("board", name, who, said, p50_ms, p99_ms, problem, notes, identity)
 
@@ -197,10 +200,10 @@ def _board_reading(reading: roles.BenchReading) -> str:
     )
 
 
-def _board_problem(reading: roles.BenchReading) -> str:
+def _board_problem(reading: roles.BenchReading, laser: bool) -> str:
     if reading.latched_faults:
         return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find the cause"
-    if not math.isfinite(reading.displacement_um):
+    if laser and not math.isfinite(reading.displacement_um):
         return f"no laser reading (code {reading.displacement_quality}); check its aim"
     return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure reading; check the sensor"
 

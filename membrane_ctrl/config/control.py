@@ -249,9 +249,9 @@ class ShapeConfig(Section):
 class EstimatorConfig(Section):
     """The estimate of the centre from laser, optics, barometer and thermometer (docs/estimator.md)."""
 
-    process_value: Literal["laser", "estimate"] = "laser"
-    """What the inner loop holds: the laser's reading, or the estimate of the centre. Change it to hold with the
-    optics."""
+    process_value: Literal["laser", "estimate", "optics"] = "laser"
+    """What the inner loop holds: the laser's reading, the estimate of the centre, or that without a laser: `optics`
+    uses none, fitted or not. Change it to hold with the optics, or by them alone."""
     gain_per_s: Annotated[float, Field(gt=0, le=20)] = 10.0
     """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is uncertain."""
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08

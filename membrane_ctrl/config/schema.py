@@ -64,7 +64,7 @@ class DevicesConfig(Section):
         if self.board is None and not filled:
             raise ValueError('name the pump board (board = "tcp://HOST:PORT"), or give one table per role')
         missing = [role for role in NEEDED if role not in filled]
-        if self.board is None and missing:
+        if self.board is None and missing not in ([], ["displacement"]):  # a laser is `Config`'s affair
             raise ValueError(f"no device for {missing[0]}; required: {', '.join(NEEDED)}")
         for role in ("pump", "vent"):
             section = getattr(self, role)
@@ -130,6 +130,8 @@ class TwinConfig(Section):
     """Start with a flat mirror; filling it takes two hours. Set it to true to practise a first inflation."""
     start_error_um: Annotated[float, Field(ge=-500, le=500)] = -25.0
     """Distance from the setpoint at the start. Change it to see a longer or shorter approach."""
+    laser: bool = True
+    """Whether there is one. Set it to false to practise a bench without a laser (estimator.process_value)."""
     laser_noise_um: Annotated[float, Field(ge=0, le=100)] = 1.0
     """Noise of a laser reading. Change it to your laser's."""
     laser_resolution_um: Annotated[float, Field(ge=0, le=100)] = 0.1
@@ -214,6 +216,10 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
+        if self.devices is not None and not (self.devices.board or self.devices.displacement or self.by_optics):
+            raise ValueError(
+                'devices: no device for displacement; without a laser set estimator.process_value = "optics"'
+            )
         if self.web is not None and not self.port.enabled:
             raise ValueError("web: the page asks the control port: set port.enabled = true")
         if self.devices is not None and isinstance(
@@ -223,6 +229,11 @@ class Config(Section):
             if bits != self.optics.camera.bits:
                 raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
         return self
+
+    @property
+    def by_optics(self) -> bool:
+        """Whether the mirror is held without a laser."""
+        return self.estimator.process_value == "optics"
 
     def with_gains(self, told: Mapping[str, Any] | None) -> "Config":
         """This configuration with the gains, and the pump's curve, of an event; as it is if they do not fit."""

@@ -68,8 +68,13 @@ class CentreFilter:
         self._gas_follows_air_s = loop.gas_follows_air_s
         self._uses = (loop.feedforward_barometer, loop.feedforward_temperature)
 
-    def start(self, displacement_um: float, flow_um_per_s: float, mount_um: float) -> None:
-        """Begin at a laser reading, a flow that balances the leak, and a known displacement of the mount."""
+    def start(
+        self, displacement_um: float, flow_um_per_s: float, mount_um: float, sag_zero_um: float = math.nan
+    ) -> None:
+        """Begin at a displacement, a flow that balances the leak, and a known displacement of the laser's mount.
+
+        `sag_zero_um`: the sag at displacement 0, of a bench without a laser; otherwise the first frames lock it.
+        """
         config, rate_hz = self._config, self._rate_hz
         self._x: FloatArray = np.zeros(_PLANT + CLONES)
         self._p: FloatArray = np.zeros((_PLANT + CLONES, _PLANT + CLONES))
@@ -93,6 +98,8 @@ class CentreFilter:
         self.frames = 0  # of the optics since lock
         self._frame_interval_s = FRESH_S[Sensor.OPTICS]
         self._last_frame_s = -math.inf
+        if math.isfinite(sag_zero_um):
+            self._origin[2], self._p[_STAND, _STAND], self.frames = sag_zero_um, 0.0, LOCK_FRAMES
 
     def relock(self) -> None:
         """Take the optics' next readings as a new zero."""
@@ -101,6 +108,14 @@ class CentreFilter:
         self._origin[2] = math.nan
         self.frames = 0
         self._watches[Sensor.OPTICS] = _Watch()
+
+    def blame_optics(self, mount_um: float) -> None:
+        """The optics were wrong: what the mount has moved from there was the centre's motion. They lock anew."""
+        moved_um = self._x[_MOUNT] - mount_um
+        self._x[_MOUNT] = mount_um
+        self._x[_GAS] += moved_um
+        self._x[_PLANT:] += moved_um
+        self.relock()
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""

@@ -127,7 +127,7 @@ class FilmMonitor:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._laser, self._root = LowPass(SMOOTH_S), LowPass(SMOOTH_S)
+        self._laser, self._trim, self._root = LowPass(SMOOTH_S), LowPass(SMOOTH_S), LowPass(SMOOTH_S)
         self._seen_s = 0.0
         self._since = (
             _Since(SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um),
@@ -148,6 +148,7 @@ class FilmMonitor:
         if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):
             return ""
         laser_um = self._laser.update(laser_um, dt_s)
+        trim_um = self._trim.update(trim_um, dt_s)  # a knock that the optics have found moves both alike
         # The mean of the root always follows the mean of the sag; the mean of the pressure does not.
         root = self._root.update(math.cbrt(gauge_pressure_pa), dt_s)
         self._seen_s += dt_s

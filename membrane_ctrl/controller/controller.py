@@ -23,6 +23,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
+_WITHOUT_LASER = "there is no laser whose mount could drift: the optics themselves are held"
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 
 
@@ -36,7 +37,7 @@ class Controller:
         self._config = config
         self._safety = safety.SafetyTable(config.limits)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
-        observer = Observer(config.limits)
+        observer = Observer(config)
         loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
         self._scene = Scene(
@@ -83,7 +84,9 @@ class Controller:
         error_um = last.error_um if judged else math.nan
         scene.observer.look(inputs)
         consistency = self._consistency
-        events += consistency.ask(inputs, self.state, scene.dt_s, sensor_consistency.hold_status(scene, last))
+        events += consistency.ask(
+            inputs, self.state, scene.dt_s, sensor_consistency.hold_status(scene, last, self._holders.optics_hold)
+        )
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
         observation = replace(
@@ -97,8 +100,8 @@ class Controller:
             locked=scene.latched,
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            optics_hold=self._holders.optics_hold,
-            estimated_um=last.filtered_um,
+            optics_hold=self._config.by_optics or self._holders.optics_hold,
+            estimated_um=last.filtered_um - scene.trim_um,
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
@@ -268,13 +271,15 @@ class Controller:
     def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
         scene = self._scene
         settled = self.state == State.HOLD and scene.levels.safe_level == SafeLevel.NONE
+        if self._consistency.laser_moved and self._shape.on:
+            self._shape.lock(inputs.now_s)
         shape = self._shape.step(
             inputs.now_s,
             scene.dt_s,
             inputs.estimate,
             scene.observer.displacement_um,
             settled,
-            self._consistency.camera_lies,
+            self._consistency.camera_lies or _WITHOUT_LASER * self._config.by_optics,
         )
         scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news

@@ -19,6 +19,8 @@ _FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is wors
 _VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
+# Figures a second to inflate by without a laser: the loop then has 0.3 s of delay and keeps its margins
+_TRACK_LEAST_HZ = 5.0
 # Differences between an honest laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
 # fresh film (control/film.py)
 _APART_UM, _CREEP_UM = 7.0, 31.0
@@ -156,6 +158,12 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
 
 
 def judge_optics(config: Config, say: ConfigFindings) -> None:
+    if config.by_optics:
+        shape, why = config.shape, "a bench held without a laser needs a figure from every frame"
+        say.error(not shape.enabled, "shape.enabled", why, "set it to true")
+        say.error(shape.mode != "track", "shape.mode", why, 'set it to "track"')
+        slow, least = shape.track_rate_hz < _TRACK_LEAST_HZ, f"set at least {_TRACK_LEAST_HZ:g} Hz"
+        say.error(slow, "shape.track_rate_hz", "too few figures to hold the mirror by", least)
     camera = config.devices is not None and config.devices.camera is not None
     _geometry("optics.geometry", config.optics, config.shape.enabled or camera, say)
     if config.twin.geometry is not None:

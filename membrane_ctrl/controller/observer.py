@@ -3,8 +3,9 @@
 import math
 
 from firmware_iface.roles import BenchCommand, BenchReading
-from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
 
@@ -45,6 +46,62 @@ class _Jumps:
         return False
 
 
+_FIGURE_S, _FIGURES = 0.5, 3  # a figure older than this, and than so many intervals, shows nothing
+_REPEATS = 3  # no two figures have the same noise
+_CAMERA_STARTS_S = 900.0  # compiling on a slow machine, and the self-test of screen and camera
+
+
+class _Figures:
+    """The centre as figures of the mirror show it: what a bench without a laser is held by.
+
+    Displacement 0 is a sag of `optics.mirror.sag_mm`. `missing` tells why there is no displacement, if so.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._zero_um = 1e3 * config.optics.mirror.sag_mm
+        self._fresh_s = max(_FIGURE_S, _FIGURES / config.shape.track_rate_hz)
+        self._jumps = _Jumps(config.limits.step_max_um)
+        self._um = self._time_s = self._first_s = math.nan
+        self._repeats = 0
+        self._refused = ""
+        self.waited_s = 0.0  # for the first figure
+        self.missing = ""
+
+    def look(self, now_s: float, figure: ShapeEstimate | None) -> float:
+        """Displacement in um by the newest figure; NaN if that is too old."""
+        if math.isnan(self._first_s):
+            self._first_s = now_s
+        if math.isnan(self._um):
+            self.waited_s = min(now_s - self._first_s, _CAMERA_STARTS_S)
+        if figure is not None:
+            self._take(figure, now_s)
+        age_s = now_s - self._time_s
+        self.missing = ""
+        if age_s <= self._fresh_s and self._repeats < _REPEATS:
+            return self._um
+        if self._repeats >= _REPEATS:
+            self.missing = "the camera repeats one figure to the last bit"
+        elif math.isnan(age_s):
+            self.missing = f"no figure of the mirror yet{self._refused}"
+        else:
+            self.missing = f"no figure of the mirror for {age_s:.1f} s{self._refused}"
+        return math.nan
+
+    def _take(self, figure: ShapeEstimate, now_s: float) -> None:
+        um = figure.sag_um - self._zero_um
+        if figure.verdict == "rejected":
+            self._refused = f": {figure.reason}"
+        elif not math.isfinite(um):
+            self._refused = ": it is not finite"
+        elif not figure.time_s <= now_s or figure.time_s <= self._time_s:
+            self._refused = ": its time is wrong"
+        elif self._jumps.refuse(um):
+            self._refused = f": the sag jumped by {um - self._um:+.0f} um"
+        else:
+            self._repeats = self._repeats + 1 if um == self._um else 0
+            self._um, self._time_s, self._refused = um, figure.time_s, ""
+
+
 class Observer:
     """Detects stale, frozen and jumping input.
 
@@ -53,14 +110,16 @@ class Observer:
     reading : BenchReading or None
         This tick's reading.
     displacement_um : float
-        The laser reading that the loop may use; NaN without one.
+        The displacement that the loop may use, by the laser, or by figures on a bench held without one; NaN without.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
     commanded : tuple of float
         The last two pump commands, newest first.
     """
 
-    def __init__(self, limits: LimitsConfig) -> None:
+    def __init__(self, config: Config) -> None:
+        limits = config.limits
+        self._figures: _Figures | None = _Figures(config) if config.by_optics else None
         self._last_read_s = math.nan
         self._last_advance_s = math.nan
         self._stamp: tuple[int, float] | None = None
@@ -86,9 +145,26 @@ class Observer:
             if self._stamp is None or (stamp[0] != self._stamp[0] and stamp[1] != self._stamp[1]):
                 self._last_advance_s = now_s
                 self._stamp = stamp
-        self.displacement_um = self._gate(reading, fresh=self._last_advance_s == now_s)
+        if self._figures is None:
+            self.displacement_um = self._gate(reading, fresh=self._last_advance_s == now_s)
+        else:
+            self.displacement_um = self._figures.look(now_s, inputs.estimate)
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
+
+    @property
+    def unseen(self) -> str:
+        """Why there is no displacement in this tick; empty if there is one."""
+        if math.isfinite(self.displacement_um):
+            return ""
+        if self._figures is not None:
+            return self._figures.missing
+        return f"no valid laser reading (quality {self.reading.displacement_quality if self.reading else 'unknown'})"
+
+    @property
+    def waited_s(self) -> float:
+        """How long a camera that is needed took to give its first figure, so far; 0 with a laser."""
+        return 0.0 if self._figures is None else self._figures.waited_s
 
     def observe(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
         """Return what the inputs show, after `look`; the control code fills in what it knows itself."""
@@ -99,7 +175,8 @@ class Observer:
             reading_age_s=now_s - self._last_read_s,
             advance_age_s=now_s - self._last_advance_s,
             same_s=self._laser_repeats.same_s(self.displacement_um, now_s),
-            displacement_um=_good_quality_um(reading),
+            displacement_um=_good_quality_um(reading) if self._figures is None else self.displacement_um,
+            unseen_film="" if self._figures is None else self._figures.missing,
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self._laser_jumps.count,
             error_um=error_um,

@@ -30,7 +30,7 @@ class Observation:
     reading_age_s: float  # since the last answer of the device
     # since the device's sample counter and time last advanced; a repeated answer does not count
     advance_age_s: float
-    displacement_um: float  # raw laser reading, NaN if bad or absent
+    displacement_um: float  # raw laser reading, or by figures on a bench without a laser; NaN if bad or absent
     displacement_valid: bool  # finite, new, of good quality, not a jump
     jumps: int  # consecutive readings refused as jumps
     error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
@@ -53,8 +53,9 @@ class Observation:
     gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
     gauge_jumps: int = 0  # consecutive readings that no film can cause
     laser_gauge_apart: str = ""  # readings of laser and gauge, if they contradict each other
-    optics_hold: bool = False  # the optics see the centre: the laser may be missing
-    estimated_um: float = math.nan  # what the laser would read by them
+    optics_hold: bool = False  # the optics see the centre, or must: the laser may be missing
+    unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
+    estimated_um: float = math.nan  # the centre by them
     gas_excess: str = ""  # excess gas the film takes, unless a camera sees it stand still
 
     @property
@@ -212,6 +213,12 @@ TABLE: tuple[Rule, ...] = (
         seen=lambda o: f"{o.advance_age_s:.2f} s", broken=lambda o, c: o.advance_age_s > c.stale_s,
     ),
     Rule(
+        code=11, name="film_unseen", cause="no figure of the film on a bench held without a laser",
+        limit="0.5 s, or 3 frames", safe_level=SafeLevel.HOLD_FLOW, may_resume=True,
+        remedy="look at camera and screen; nothing else sees the film well enough to hold it",
+        seen=lambda o: o.unseen_film, broken=lambda o, c: bool(o.unseen_film),
+    ),
+    Rule(
         code=14, name="laser_implausible",
         cause="camera and gauge agree that the laser is wrong",
         limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=HOLDING,
@@ -219,7 +226,7 @@ TABLE: tuple[Rule, ...] = (
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
     ),
     Rule(
-        code=18, name="laser_gauge_apart", cause="laser and gauge contradict each other",
+        code=18, name="laser_gauge_apart", cause="laser (or optics, without a laser) and gauge contradict each other",
         limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um", safe_level=SafeLevel.RAMP_DOWN,
         states=CONNECTED,
         remedy="find which of them is wrong: laser mount, gauge hose, units; for another film set [optics.mirror] "

@@ -186,7 +186,10 @@ def telemetry_row(
         ambient_pressure_pa=reading.ambient_pressure_pa,
         air_temperature_c=reading.air_temperature_c,
         gas_temperature_c=reading.gas_temperature_c,
-        displacement_quality=reading.displacement_quality if inputs.reading else math.nan,
+        # of the laser's readings: rows without one must not pass for such
+        displacement_quality=math.nan
+        if scene.config.by_optics or not inputs.reading
+        else reading.displacement_quality,
         sample_counter=reading.sample_counter if inputs.reading else math.nan,
         device_time_s=reading.device_time_s,
         leak_um_per_s=out.leak_um_per_s,

@@ -8,6 +8,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import film, film_health, gas, inner_loop
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
+from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
@@ -34,9 +35,10 @@ class HoldStatus:
     leak_um_per_s: float  # as the inner loop estimates it; NaN without
     flow_um_per_s: float  # of the pump; NaN without
     bleed_fraction: float  # of the vent, held open on purpose
+    optics_hold: bool = False  # they see the centre, and its estimate is held: a laser that moved is known
 
 
-def hold_status(scene: Scene, last: inner_loop.LoopOutput) -> HoldStatus:
+def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) -> HoldStatus:
     """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick before."""
     return HoldStatus(
         laser_um=scene.observer.displacement_um,
@@ -47,6 +49,7 @@ def hold_status(scene: Scene, last: inner_loop.LoopOutput) -> HoldStatus:
         leak_um_per_s=last.leak_um_per_s,
         flow_um_per_s=last.flow_um_per_s,
         bleed_fraction=scene.loop_config.bleed_fraction,
+        optics_hold=optics_hold,
     )
 
 
@@ -59,6 +62,8 @@ class SensorConsistency:
         As in `Observation`.
     camera_lies : str
         Readings of laser, gauge and camera, if the camera is wrong: a reason for the shape loop.
+    laser_moved : bool
+        From this tick on the laser is believed in its new place; the shape loop must lock anew.
     """
 
     def __init__(self, config: Config) -> None:
@@ -67,6 +72,7 @@ class SensorConsistency:
         self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump))
         self._pump = film_health.PumpHealth(config.pump.change_max)
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)
+        self._by_optics = config.by_optics
         self._growth = film.LeakGrowth()
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s
@@ -74,6 +80,7 @@ class SensorConsistency:
         self._sag_um, self._repeats = math.nan, 0
         self._setpoint_um, self._bleed_fraction = config.loop.setpoint_um, config.loop.bleed_fraction
         self._liar = film.Liar.NOBODY
+        self._lies_s, self.laser_moved = 0.0, False
         self._weather_s = 0.0
         self._weather_told = False
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
@@ -88,7 +95,8 @@ class SensorConsistency:
             self._bleed_fraction = held.bleed_fraction
             self._growth.reset()
         if state in safety.CONNECTED:
-            self.laser_gauge_apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
+            apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
+            self.laser_gauge_apart = apart.replace("laser", "optics") if self._by_optics else apart
         elif self._film.watching:
             self._film.reset()
             self.laser_gauge_apart = ""
@@ -96,10 +104,21 @@ class SensorConsistency:
             return self._rest()
         self._look_at_camera(inputs)
         events = self._judge_weather(inputs, dt_s)
-        events += self._judge(self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate))
+        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate)
+        self._lies_s = self._lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
+        self.laser_moved = self._lies_s > film.WARM_S  # a knock is over: the estimate knows the laser's new place
+        if self.laser_moved:
+            self._plausibility.reset()
+            liar = film.Liar.NOBODY
+        events += self._judge(liar)
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
         events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
         return events
+
+    @property
+    def agree(self) -> bool:
+        """Laser and camera do not contradict each other, as far as is known."""
+        return self._liar == film.Liar.NOBODY and not self.camera_lies
 
     def set_gains(self, loop: LoopConfig, pump: PumpConfig) -> None:
         """Judge by the gains and the curve that are now in force."""
@@ -118,6 +137,7 @@ class SensorConsistency:
 
     def _rest(self) -> list[Event]:
         """Reset: the mirror is not held, or not yet at its setpoint."""
+        self._lies_s, self.laser_moved = 0.0, False
         self._growth.moves()
         self.gas_excess = ""
         if self._plausibility.watching:
@@ -135,7 +155,7 @@ class SensorConsistency:
 
     def _most_growth(self, inputs: TickInputs) -> float:
         """Allowed growth of the leak: unlimited while the camera agrees with the laser."""
-        if self._repeats >= _REPEATS:
+        if self._by_optics or self._repeats >= _REPEATS:
             return self._leak_growth_max
         if not inputs.now_s - self._camera_s <= self._fresh_s:
             return self._leak_growth_max
@@ -166,7 +186,8 @@ class SensorConsistency:
         if liar == self._liar:
             return []
         self._liar = liar
-        return [Plausibility(liar.name.lower(), str(self._plausibility.changes))]
+        seen = str(self._plausibility.changes) if self._plausibility.watching else "compared anew from here on"
+        return [Plausibility(liar.name.lower(), seen)]
 
 
 def _of_warning(warning: film_health.FilmWarning) -> Event:
@@ -182,9 +203,12 @@ class Holders:
     """Runs the estimate beside the states if `estimator.process_value` asks for it."""
 
     def __init__(self, config: Config) -> None:
-        self._wanted = config.estimator.process_value == "estimate"
+        self._wanted = config.estimator.process_value != "laser"
+        self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
         self._filter = CentreFilter(config.estimator, config.loop)
         self._running = self._locking = False
+        # while laser and camera agree: what the filter then gave to the mount was the film's, if the camera was wrong
+        self._agreed_mount = LowPass(film.REFERENCE_S)
         self._told: tuple[int, ...] | None = None
         self._news_s = math.nan
         self.estimate: CentreEstimate | None = None
@@ -208,25 +232,31 @@ class Holders:
         consistency: SensorConsistency,
     ) -> list[Event]:
         """One tick, after the sensors were judged; returns what is news."""
-        flow_um_per_s, laser_um = last.flow_um_per_s, scene.observer.displacement_um
+        flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
         if not self._wanted or state not in _ESTIMATED or not math.isfinite(flow_um_per_s):
             self.estimate, self._running, self._told = None, False, None
             return []
-        if consistency.laser_lies:
-            laser_um = math.nan
+        by_optics = math.isfinite(self._sag_zero_um)
+        laser_um = math.nan if by_optics or consistency.laser_lies else seen_um
         if not self._running:
-            start_um = last.filtered_um if math.isfinite(last.filtered_um) else laser_um
+            start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um)
+            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._sag_zero_um)
             self._running = True
-        if shape == ShapeState.OFF:
+            self._agreed_mount.reset(scene.trim_um)
+        off = shape == ShapeState.OFF and not by_optics
+        if off:
             self._locking = True
         elif self._locking:
             self._filter.relock()
             self._locking = False
+        if consistency.agree and self.estimate is not None:
+            self._agreed_mount.update(self.estimate.mount_um, scene.dt_s)
+        elif consistency.camera_lies and self._filter.frames:
+            self._filter.blame_optics(self._agreed_mount.value)
         figure = inputs.estimate
-        if shape == ShapeState.OFF or consistency.camera_lies or (figure and figure.verdict == "rejected"):
+        if off or consistency.camera_lies or (figure and figure.verdict == "rejected"):
             figure = None
         reading = inputs.reading
         readings = CentreReadings(

@@ -39,7 +39,7 @@ def check(scene: Scene) -> State:
     # occasional lost answers do not make a bad sensor
     gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
     good_s = scene.stay_good(not gone)
-    if scene.state_age_s > scene.config.states.check_timeout_s:
+    if scene.state_age_s > scene.config.states.check_timeout_s + scene.observer.waited_s:
         scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {missing}"
     if gone:
         scene.test = None  # repeat a measurement with a gap
@@ -61,7 +61,7 @@ def inflate(scene: Scene) -> State:
     lag = abs(scene.loop.lag_um) / states.inflate_pause_um
     output = _drive(scene, scene.loop.ramp_um if lag > 1.0 else scene.setpoint_um)
     to_go_um = scene.setpoint_um - output.filtered_um
-    to_go = f"{to_go_um:.1f} um to go" if math.isfinite(to_go_um) else "no laser reading"
+    to_go = f"{to_go_um:.1f} um to go" if math.isfinite(to_go_um) else scene.observer.unseen or "no reading"
     # a waiting ramp starts and stops at the limit, several times a second: the words must not
     scene.why = f"inflating: {to_go}" + (", the ramp waits for the mirror" if lag > 0.8 else "")
     ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
@@ -325,8 +325,8 @@ def _missing(scene: Scene) -> str:
     reading = scene.observer.reading
     if reading is None:
         return "no answer from the device"
-    if not math.isfinite(scene.observer.displacement_um):
-        return f"no valid laser reading (quality {reading.displacement_quality})"
+    if unseen := scene.observer.unseen:
+        return unseen
     if not math.isfinite(reading.gauge_pressure_pa):
         return "no gauge pressure"
     if reading.latched_faults:
@@ -335,8 +335,9 @@ def _missing(scene: Scene) -> str:
 
 
 def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
+    by_optics = scene.config.by_optics
     if scene.levels.safe_level == SafeLevel.HOLD_FLOW:
-        return "holding the last mean flow until the laser is back"
+        return f"holding the last mean flow until the {'optics see the film' if by_optics else 'laser is back'}"
     if output.too_tight:
         return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"
     if output.saturated:

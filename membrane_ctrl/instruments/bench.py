@@ -44,7 +44,7 @@ def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
     Raises InputError for a port, URL, preset or setting that the driver does not accept.
     """
     links = modbus_rtu.ModbusLinks()
-    made: dict[str, Any] = {}
+    made: dict[str, Any] = {"displacement": None}  # a bench held by its optics may have none
     for role, section in devices.roles().items():
         try:
             made[role] = _driver(role, section, links)

@@ -72,7 +72,7 @@ class Sensors:
         """A new sample; the counter advances by one. Without light the displacement is NaN, its quality not 0."""
         config = self._config
         laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
-        lost = truth.laser_lost > 0
+        lost = truth.laser_lost > 0 or not config.laser
         reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
         self._counter += 1
         return BoardSample(

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.safety import Observation
 from membrane_ctrl.controller.tick import TickInputs
@@ -22,14 +22,14 @@ def look(observer: Observer, tick: int, displacement_um: float, counter: int, de
 
 
 def test_a_sample_is_new_only_when_counter_and_time_have_both_advanced() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     stamps = [(1, 0.1), (2, 0.1), (1, 0.2), (2, 0.2)]
     valid = [look(observer, tick, 0.1 * tick, *stamp).displacement_valid for tick, stamp in enumerate(stamps, 1)]
     assert valid == [True, False, False, True]
 
 
 def test_a_jump_is_believed_after_ten_refusals() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     look(observer, 1, 0.0, 1, 0.02)
     valid = [look(observer, tick, 200.0, tick, 0.02 * tick).displacement_valid for tick in range(2, 14)]
     assert valid == [False] * 10 + [True] * 2
@@ -43,7 +43,7 @@ def gauge(observer: Observer, tick: int, gauge_pa: float) -> Observation:
 
 
 def test_a_gauge_that_repeats_itself_is_timed_and_any_change_ends_it() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     same_s = [gauge(observer, tick, 600.0).gauge_same_s for tick in range(1, 12)]
     assert same_s[0] == 0.0
     assert math.isclose(same_s[-1], 1.0)
@@ -52,19 +52,19 @@ def test_a_gauge_that_repeats_itself_is_timed_and_any_change_ends_it() -> None:
 
 
 def test_the_gauge_of_a_slack_film_may_stand_at_its_zero() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     assert {gauge(observer, tick, 0.0).gauge_same_s for tick in range(1, 100)} == {0.0}
 
 
 def test_a_gauge_that_jumps_is_believed_after_ten_refusals() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     gauge(observer, 1, 600.0)
     jumps = [gauge(observer, tick, 500.0 + 0.1 * tick).gauge_jumps for tick in range(2, 14)]
     assert jumps == [*range(1, 11), 0, 0]
 
 
 def test_a_gauge_that_jumps_is_no_evidence_and_is_judged_by_its_limits_nevertheless() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     gauge(observer, 1, 600.0)
     seen = gauge(observer, 2, 2000.0)
     assert seen.gauge_pressure_pa == 2000.0
@@ -74,7 +74,7 @@ def test_a_gauge_that_jumps_is_no_evidence_and_is_judged_by_its_limits_neverthel
 
 
 def test_a_read_back_that_is_no_number_does_not_follow_its_command() -> None:
-    observer = Observer(LimitsConfig())
+    observer = Observer(Config())
     reading = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.02, False, 0)
     for tick, (pump, mismatch) in enumerate(((0.0, 0.0), (0.3, 0.3), (math.nan, math.inf)), 1):
         inputs = TickInputs(0.02 * tick, 0.02, replace(reading, pump_fraction=pump))

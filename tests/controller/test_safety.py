@@ -39,6 +39,7 @@ BAD = {
     "board_fault": replace(GOOD, board_faults=4),
     "pump_mismatch": replace(GOOD, pump_mismatch=0.2),
     "displacement_frozen": replace(GOOD, advance_age_s=LIMITS.stale_s + 0.01),
+    "film_unseen": replace(GOOD, unseen_film="no figure of the mirror for 0.6 s"),
     "laser_implausible": replace(GOOD, laser_lies="laser +30 um, camera 0 um, gauge 0 um"),
     "displacement_stuck": replace(GOOD, same_s=LIMITS.stuck_s + 0.01),
     "laser_gauge_apart": replace(GOOD, laser_gauge_apart="laser +0 um, gauge +40 um"),

@@ -75,13 +75,20 @@ class FakeDevice:
 class Devices:
     """Six fakes and their bench."""
 
-    def __init__(self, vent: bool = True) -> None:
+    def __init__(self, vent: bool = True, laser: bool = True) -> None:
         self.log: list[str] = []
         self.laser, self.pump, self.gauge, self.barometer, self.air, self.vent = (
             FakeDevice(kind, self.log) for kind in ("laser", "pump", "gauge", "barometer", "air", "vent")
         )
         self.laser.value, self.gauge.value, self.barometer.value = 7.0, 600.0, 101_325.0
-        roles = RoleDevices(self.laser, self.pump, self.gauge, self.vent if vent else None, self.barometer, self.air)
+        roles = RoleDevices(
+            self.laser if laser else None,
+            self.pump,
+            self.gauge,
+            self.vent if vent else None,
+            self.barometer,
+            self.air,
+        )
         self.bench = RoleBench(roles, WATCHDOG_S, lambda: asyncio.get_running_loop().time())
 
 
@@ -195,6 +202,24 @@ def test_a_lost_actuator_is_a_lost_bench_but_the_other_one_is_still_commanded(na
             await devices.bench.write(BenchCommand(0.25, 0.25))
         assert other.value == 0.25
         await devices.bench.close()
+
+    virtual(run())
+
+
+def test_without_a_laser_the_bench_still_advances() -> None:
+    """It is held by its optics (`estimator.process_value`)."""
+
+    async def run() -> None:
+        bench = Devices(laser=False).bench
+        assert (await bench.open()).displacement_range_um == (-math.inf, math.inf)
+        first = await bench.read()
+        await asyncio.sleep(0.02)
+        second = await bench.read()
+        assert math.isnan(second.displacement_um)
+        assert second.displacement_quality != 0
+        assert second.sample_counter == first.sample_counter + 1
+        assert second.device_time_s > first.device_time_s
+        await bench.close()
 
     virtual(run())
 

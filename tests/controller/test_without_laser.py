@@ -1,0 +1,303 @@
+"""A bench held by its optics alone, and a laser that is knocked while the optics see the film; in virtual time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.controller import observer
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.cross_check import cross_check
+from membrane_ctrl.controller.tick import TickInputs
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.events import CommandTaken, Fault, HeldBy, Plausibility, ShapeLoopState
+from membrane_ctrl.model.telemetry import SafeLevel, State
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import AmbientChange
+from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
+
+TWIN = TwinConfig(laser=False, start_error_um=-5.0, scenario="quiet")
+BY_OPTICS = Config(estimator=EstimatorConfig(process_value="optics"), shape=ShapeConfig(mode="track"), twin=TWIN)
+BY_ALL = Config(
+    estimator=EstimatorConfig(process_value="estimate"), twin=TwinConfig(start_error_um=-1.0, scenario="quiet")
+)
+NOTHING: Callable[[Wrong, float], None] = lambda wrong, now_s: None  # noqa: E731
+
+
+def held(
+    until_s: float,
+    fail: Callable[[Wrong, float], None] = NOTHING,
+    config: Config = BY_OPTICS,
+    jump_pa: float = 0.0,
+    commands: dict[int, Command] | None = None,
+) -> list[VirtualTick]:
+    """A hold with 16 figures a second; the air pressure jumps at 35 s."""
+    bench = VirtualBench(Plant(config.twin, config.pump, (AmbientChange(35.0, jump_pa, 0.1),)))
+    run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, 3, 0.036))
+    run._shape_period_s = 0.06
+    asked = {1: Command("hold", "a test", "it runs")} | (commands or {})
+    ticks: list[VirtualTick] = []
+    while run.now_s < until_s:
+        fail(bench.wrong, run.now_s)
+        number = len(ticks) + 1
+        tick = run.tick((asked[number],) if number in asked else ())
+        if tick is None:
+            break
+        ticks.append(tick)
+    return ticks
+
+
+def told(ticks: list[VirtualTick], kind: type[Any]) -> list[Any]:
+    return [event for tick in ticks for event in tick.events if isinstance(event, kind)]
+
+
+def true_um(ticks: list[VirtualTick], from_s: float, to_s: float = math.inf) -> np.ndarray:
+    return np.array([tick.row.truth_displacement_um for tick in ticks if from_s <= tick.row.mono_s < to_s])
+
+
+def states(ticks: list[VirtualTick]) -> list[State]:
+    """The states in order."""
+    seen = [State(int(tick.row.state)) for tick in ticks]
+    return [state for before, state in zip([None, *seen], seen, strict=False) if state != before]
+
+
+# Without a laser.
+
+
+def test_a_bench_without_a_laser_starts_settles_and_holds_the_sag_it_was_told() -> None:
+    ticks = held(28.0)
+    assert states(ticks) == [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD]
+    assert not told(ticks, Fault)
+    assert [event.sensors for event in told(ticks, HeldBy)] == ["optics, barometer, thermometer"]
+    held_um = true_um(ticks, 18.0)
+    assert held_um.std() < 0.05
+    nominal = Plant(TWIN, BY_OPTICS.pump).truth()
+    zero_um = 1e3 * (BY_OPTICS.optics.mirror.sag_mm - nominal.sag_mm) + nominal.displacement_um  # of the optics
+    assert held_um.mean() == pytest.approx(zero_um, abs=0.1)
+    row = ticks[-1].row
+    assert math.isfinite(row.displacement_um)
+    assert math.isnan(row.displacement_quality)  # nobody takes it for a laser's
+
+
+def test_a_laser_that_is_there_has_no_part_in_it() -> None:
+    def knock(wrong: Wrong, now_s: float) -> None:
+        wrong.laser_offset_um = 80.0 if now_s > 20.0 else 0.0
+
+    config = BY_OPTICS.model_copy(update={"twin": TWIN.model_copy(update={"laser": True})})
+    ticks = held(26.0, knock, config)
+    assert not told(ticks, Fault)
+    assert np.ptp(true_um(ticks, 18.0)) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("for_s", "most_um"), [(0.3, 0.1), pytest.param(6.0, 0.3, marks=pytest.mark.campaign)], ids=["blink", "6 s"]
+)
+def test_optics_that_are_lost_and_back_make_no_bump(for_s: float, most_um: float) -> None:
+    def lose(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = 20.0 < now_s < 20.0 + for_s
+
+    ticks = held(22.0 + for_s, lose)
+    moved_um = np.abs(true_um(ticks, 20.0) - true_um(ticks, 17.0, 20.0).mean())
+    assert moved_um.max() < most_um
+    assert [fault.name for fault in told(ticks, Fault)] == ["film_unseen"] * (for_s > 0.5)
+    assert ticks[-1].row.safe_level == SafeLevel.NONE
+
+
+def test_optics_that_are_lost_for_good_end_in_the_safe_state_with_one_line() -> None:
+    def lose(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = now_s > 16.0
+
+    ticks = held(60.0, lose)
+    (fault,) = told(ticks, Fault)
+    assert (fault.name, fault.seen) == ("film_unseen", "no figure of the mirror for 0.5 s")
+    level = {tick.row.safe_level: tick.row.mono_s for tick in reversed(ticks)}
+    assert level[SafeLevel.HOLD_FLOW] == pytest.approx(16.5, abs=0.1)
+    assert level[SafeLevel.RAMP_DOWN] == pytest.approx(28.5, abs=0.1)  # states.hold_flow_max_s
+    assert ticks[-1].row.pump_fraction == 0.0
+    assert ticks[-1].outputs.finished == errors.Exit.SAFETY_TRIP
+
+
+@pytest.mark.parametrize(("wait_s", "starts"), [(900.0, True), (5.0, False)])
+def test_a_start_waits_for_a_camera_that_prepares(
+    wait_s: float, starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cold machine compiles for a minute; but it does not wait for ever."""
+    monkeypatch.setattr(observer, "_CAMERA_STARTS_S", wait_s)
+
+    def prepares(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = now_s < 40.0
+
+    ticks = held(48.0, prepares)
+    assert (State.INFLATE in states(ticks)) == starts
+    why = "sensors still not good after 15 s: no figure of the mirror yet"
+    assert [fault.seen for fault in told(ticks, Fault)] == ([] if starts else [why])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "seen"),
+    [
+        (lambda figure, n: None if n % 2 else figure, ""),
+        (lambda figure, n: _with(figure, verdict="rejected", reason="a hand") if n % 3 else figure, ""),
+        (lambda figure, n: None, "no figure of the mirror for 0.5 s"),
+        (lambda figure, n: _with(figure, sag_um=37_100.0), "the camera repeats one figure to the last bit"),
+        (lambda figure, n: _with(figure, sag_um=math.nan), "no figure of the mirror for 0.5 s: it is not finite"),
+        (
+            lambda figure, n: _with(figure, sag_um=37_300.0 + n),
+            "no figure of the mirror for 0.5 s: the sag jumped by",
+        ),
+        (lambda figure, n: _with(figure, time_s=figure.time_s - 0.6), "no figure of the mirror for 0.5 s: its time"),
+        (lambda figure, n: _with(figure, time_s=figure.time_s + 9), "no figure of the mirror for 0.5 s: its time"),
+        (lambda figure, n: _with(figure, time_s=math.nan), "no figure of the mirror for 0.5 s: its time"),
+        (
+            lambda figure, n: _with(figure, verdict="rejected", reason="a hand"),
+            "no figure of the mirror for 0.5 s: a hand",
+        ),
+    ],
+    ids=[
+        "every other",
+        "two of three",
+        "lost",
+        "repeated",
+        "nan",
+        "jump",
+        "old",
+        "of the future",
+        "never",
+        "rejected",
+    ],
+)
+def test_a_figure_counts_only_if_it_shows_the_film_now(spoil: Callable[[Any, int], Any], seen: str) -> None:
+    figures = TruthShape(VirtualBench(Plant(TWIN, BY_OPTICS.pump)), BY_OPTICS, 3, 0.036)
+    watching = observer.Observer(BY_OPTICS)
+    why: list[str] = []
+    for n in range(54):
+        now_s = round(0.02 * n, 2)
+        figure = None if n % 3 else figures(now_s)  # as good ones are: until 0.48 s
+        if n > 24 and figure is not None:
+            figure = spoil(figure, n // 3)
+        watching.look(TickInputs(now_s=now_s, dt_s=0.02, reading=None, estimate=figure))
+        if watching.unseen:
+            assert math.isnan(watching.displacement_um)
+            why.append(watching.unseen)
+        else:
+            assert abs(watching.displacement_um) < 20
+    assert why == [] if not seen else why[0].startswith(seen)
+
+
+def _with(figure: Any, **changes: Any) -> Any:
+    return replace(figure, **changes)
+
+
+def test_the_optics_of_such_a_bench_cannot_be_switched_off() -> None:
+    ticks = held(1.0, commands={20: Command("shape_off", "a test")})
+    refusals = [taken.refused for taken in told(ticks, CommandTaken) if taken.command == "shape_off"]
+    assert refusals == ["the mirror is held by the optics alone (estimator.process_value)"]
+
+
+@pytest.mark.parametrize(
+    ("shape", "field"),
+    [
+        ({"mode": "cycle"}, "shape.mode"),
+        ({"mode": "track", "enabled": False}, "shape.enabled"),
+        ({"mode": "track", "track_rate_hz": 1.0}, "shape.track_rate_hz"),
+    ],
+)
+def test_a_camera_that_is_too_slow_for_it_is_refused(shape: dict[str, Any], field: str) -> None:
+    found = cross_check(BY_OPTICS.model_copy(update={"shape": ShapeConfig(**shape)}))
+    assert [finding.field for finding in found if finding.severity == "error"] == [field]
+
+
+def test_devices_without_a_laser_are_accepted_only_for_such_a_bench() -> None:
+    devices: Any = {
+        "pump": {"driver": "ventus", "port": "/dev/a"},
+        "gauge_pressure": {"driver": "mks_937b", "port": "/dev/b"},
+    }
+    sound = BY_OPTICS.model_dump(exclude={"devices"}) | {"devices": devices}
+    assert Config.model_validate(sound).by_optics
+    with pytest.raises(ValueError, match=r'without a laser set estimator.process_value = "optics"'):
+        Config.model_validate(sound | {"estimator": {"process_value": "estimate"}})
+
+
+# A laser that is knocked.
+
+
+def _judge_knock(um: float, until_s: float) -> None:
+    """The first comparison of laser, camera and gauge is at 37 s."""
+
+    def knock(wrong: Wrong, now_s: float) -> None:
+        wrong.laser_offset_um = um if now_s > 38.0 else 0.0
+
+    ticks = held(until_s, knock, BY_ALL)
+    assert not told(ticks, Fault)
+    moved_um = np.abs(true_um(ticks, 38.0) - true_um(ticks, 30.0, 38.0).mean())
+    assert moved_um.max() < 0.3
+    jumps = [event.jumped for event in told(ticks, HeldBy) if event.jumped]
+    assert [jump.split()[0] for jump in jumps] == ["laser"]
+    assert float(jumps[0].split()[1]) == pytest.approx(um, abs=4.5)
+    liars = [event.liar for event in told(ticks, Plausibility)]
+    assert liars == ["laser", "nobody"]
+    assert ticks[-1].row.laser_innovation == pytest.approx(0.0, abs=5.0)  # it is used again
+    assert told(ticks, ShapeLoopState)[-1].state == "tracking"
+
+
+def test_a_knocked_laser_is_told_once_and_the_optics_hold_on() -> None:
+    _judge_knock(60.0, 73.0)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", range(12))
+def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    _judge_knock(float(np.exp(rng.uniform(math.log(14.0), math.log(400.0))) * rng.choice([-1.0, 1.0])), 120.0)
+
+
+# A film that jumps.
+
+
+def _blind(um: float) -> Callable[[Wrong, float], None]:
+    """A camera that has not seen that the film moved; nor is there a barometer."""
+
+    def fail(wrong: Wrong, now_s: float) -> None:
+        wrong.barometer_lost = now_s > 34.9
+        wrong.camera_offset_um = -um if now_s > 35.0 else 0.0
+
+    return fail
+
+
+def _judge_jump(um: float, seen: bool) -> None:
+    ticks = held(
+        49.0 + 200.0 / abs(um) + (um / 0.9 if um > 0 else -um / 3.0),
+        _blind(0.0 if seen else um),
+        BY_ALL,
+        jump_pa=um / -0.358,
+    )
+    assert not told(ticks, Fault)
+    liars = [event.liar for event in told(ticks, Plausibility)]
+    assert liars == ([] if seen else ["optics"])
+    before_um = true_um(ticks, 25.0, 35.0).mean()
+    assert np.abs(true_um(ticks, 35.0, 36.0) - before_um).max() == pytest.approx(abs(um), rel=0.15)
+    assert true_um(ticks, ticks[-1].row.mono_s - 3.0).mean() == pytest.approx(before_um, abs=0.1 if seen else 3.0)
+
+
+@pytest.mark.parametrize(
+    "seen", [pytest.param(True, marks=pytest.mark.campaign), False], ids=["seen", "unseen by the camera"]
+)
+def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) -> None:
+    """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is undone."""
+    _judge_jump(-25.0, seen)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_jump_of_any_size_is_brought_back(seed: int, seen: bool) -> None:
+    rng = np.random.default_rng(seed)
+    _judge_jump(float(np.exp(rng.uniform(math.log(15.0), math.log(50.0))) * rng.choice([-1.0, 1.0])), seen)
