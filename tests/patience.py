@@ -33,9 +33,9 @@ def patient_check(answer_s: float = ANSWER_S) -> Iterator[None]:
     """`check` waits that long; drivers of other packages check their time-outs, which are at most 5 s."""
     probes = check._probes
 
-    async def patient(devices: DevicesConfig) -> list[DeviceProbe]:
+    async def patient(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
         waits = {role: table.model_copy(update={"timeout_s": answer_s}) for role, table in devices.roles().items()}
-        return await probes(devices.model_copy(update={"timeout_s": answer_s, **waits}))
+        return await probes(devices.model_copy(update={"timeout_s": answer_s, **waits}), laser)
 
     with patch("membrane_ctrl.commissioning.check._probes", patient):
         yield
