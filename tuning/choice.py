@@ -14,7 +14,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.controller.cross_check import require_sound
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sessions.folder import SessionFolder, open_session
+from membrane_ctrl.sessions.folder import SessionFolder, newest_session, open_session
 from membrane_ctrl.sessions.live_hold import HoldLink, Progress
 from tuning import gains_file, pump_trial, session
 from tuning.identification.loop_model import Gains
@@ -99,8 +99,10 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
 
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
-    folder, shape_s = _named(name, logs)
     config = toml_file.load(path, schema.Config)
+    if config.estimator.process_value == "estimate":
+        return _save_estimator(path, newest_session(logs) if name is None else open_session(name), config, yes)
+    folder, shape_s = _named(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS
     gains, pump = config.loop, config.pump
     if shape_s is None or folder.done("verify") or pump_trial.mapped(folder):
@@ -126,17 +128,38 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     if not any(changed.values()):
         print(f"{path} already has the gains of {folder.path.name}")
         return errors.Exit.DONE
+    if not _replaced(path, before, after, folder, yes):
+        return errors.Exit.DONE
+    told = gains_file.entry("saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains)
+    gains_file.note(folder.path.resolve().parents[1], told)
+    return errors.Exit.DONE
+
+
+def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, yes: bool) -> int:
+    """Save the pump and the noise levels that a session measured: the loop of an estimate has no other gains."""
+    _require_same_devices(path, config, folder)
+    known = config.estimator.model_dump() | session.estimator_of(folder)
+    estimator = toml_file.parse(known, schema.EstimatorConfig, str(folder.path))
+    changed = {"estimator": _changes(config.estimator, estimator)}
+    if not changed["estimator"]:
+        print(f"{path} already has the noise levels of {folder.path.name}")
+        return errors.Exit.DONE
+    before = files.read_text(path, follow=True)
+    _replaced(path, before, _with(before, changed, path), folder, yes)
+    return errors.Exit.DONE
+
+
+def _replaced(path: Path, before: str, after: str, folder: SessionFolder, yes: bool) -> bool:
+    """Show the difference and ask, unless `yes`; whether the file was written."""
     shown = difflib.unified_diff(
         before.splitlines(), after.splitlines(), str(path), folder.path.name, lineterm="", n=1
     )
     print("\n".join(shown))
     if not yes and not (sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")):
         print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
-        return errors.Exit.DONE
+        return False
     _replace(path, before, after)
-    told = gains_file.entry("saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains)
-    gains_file.note(folder.path.resolve().parents[1], told)
-    return errors.Exit.DONE
+    return True
 
 
 def _named(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:

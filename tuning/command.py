@@ -21,6 +21,11 @@ from tuning.rig import HoldRig
 
 _TOO_TIGHT = "the mirror is too tight to be held within its band: open the bleed (loop.bleed_fraction)"
 NEEDS_BOKEH = "{} needs Bokeh: pip install 'membrane-ctrl[web]'"
+_NO_GAINS = (
+    "the hold follows the estimate, whose loop has no gains to design: `membrane-ctrl tune save {} --config FILE` "
+    "hands pump and noise levels to [estimator]"
+)
+_OF_GAINS = frozenset({"design", "preview", "apply", "verify"})
 _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 
@@ -72,6 +77,12 @@ def one_step(step: str, options: TuneOptions) -> int:
 
 def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneOptions, progress: Progress) -> None:
     for number, step in enumerate(todo):
+        if step in _OF_GAINS and folder.config.estimator.process_value == "estimate":
+            told = _NO_GAINS.format(folder.path)
+            if todo == [step]:
+                raise RejectedError(f"{step}: {told}")
+            progress.say(told)
+            return
         if step == "apply" and not choice.chosen(folder, rig, options.yes, options.choose, progress):
             progress.say(
                 f"nothing is applied; `membrane-ctrl tune apply --session {folder.path}` applies a candidate later"

@@ -23,6 +23,11 @@ from tuning.identification.characterise import FULL, SHORT, Plan
 from tuning.proposal.verify import STAGES
 from tuning.rig import HoldRig
 
+_WITHOUT_LASER = (
+    "tune reads a laser in every tick, and this hold uses none (estimator.process_value); it learns its noise levels "
+    "by itself, and pump_delay_s and pump_lag_s of [estimator] may be 30 % wrong"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class TuneOptions:
@@ -73,6 +78,7 @@ def opened(
     """Yield a session's folder and hold; restore the last good gains if it ends early, and say how to go on."""
     progress = Progress()
     with linked(options) as link:
+        _require_laser(link.config)
         folder = folder_of(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
         rig.good = folder.head.before, folder.config.pump
@@ -93,6 +99,11 @@ def opened(
                 raise
 
 
+def _require_laser(config: Config) -> None:
+    if config.by_optics:
+        raise InputError(_WITHOUT_LASER)
+
+
 def _go_back(rig: HoldRig, progress: Progress) -> None:
     progress.interrupted = False
     try:
@@ -107,6 +118,7 @@ def linked(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
     if not options.twin:
         return live_hold(options.where, options.take_over, wait=options.wait)
     config = open_session(options.session).config if options.session is not None else options.config
+    _require_laser(config)
     try:
         return contextlib.closing(TwinHold(config))
     except HoldError as error:

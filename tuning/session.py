@@ -152,6 +152,29 @@ def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
     return session.result("observe", "disturbance.json", DisturbanceModel)
 
 
+_WALK_RAD_PER_S = 1.0  # where the estimate weighs the weather sensors against what it expects of the weather
+
+
+def estimator_of(session: folder.SessionFolder) -> dict[str, float]:
+    """What the session measured of `[estimator]`: the pump, and noise and unrest of the sensors that are there."""
+    model, seen = found_of(session).identified.model, disturbance_of(session)
+    levels = {
+        "pump_delay_s": model.dead_time_s,
+        "pump_lag_s": model.lag_s,
+        "laser_noise_um": seen.laser_um,
+    }
+    for name, unit, walk, weather in (
+        ("barometer", "pa", "pressure", seen.barometer),
+        ("thermometer", "k", "air", seen.air),
+    ):
+        if weather is not None:
+            levels[f"{name}_noise_{unit}"] = weather.noise
+            density = float(weather.psd(np.array([_WALK_RAD_PER_S]))[0])
+            levels[f"{walk}_walk_{unit}_per_root_s"] = _WALK_RAD_PER_S * math.sqrt(density)
+    rounded = {key: float(f"{value:.3g}") for key, value in levels.items()}
+    return {key: value for key, value in rounded.items() if value > 0 and math.isfinite(value)}
+
+
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
     """Compute the candidates and propose gains. Raises RejectedError if the data do not support a proposal."""
     found, disturbance = found_of(session), disturbance_of(session)

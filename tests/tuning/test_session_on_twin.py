@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run as command_line
-from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import Config, EstimatorConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.model.errors import Exit, InputError, RejectedError
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, open_session
+from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, create_session, open_session
+from membrane_ctrl.sessions.live_hold import Progress
 from tuning import command as tune
 from tuning import gains_file as journal
 from tuning import report, session
@@ -225,6 +227,47 @@ def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder
     done.begin("observe")
     with pytest.raises(InputError, match="observe is missing; run `membrane-ctrl tune observe` first"):
         session.design_step(done)
+
+
+def test_the_estimate_is_told_what_the_session_measured(
+    done: SessionFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The twin's own numbers; its laser rounds to 0.1 um."""
+    twin, found = TwinConfig(), session.estimator_of(done)
+    assert found["pump_delay_s"] + found["pump_lag_s"] == pytest.approx(twin.pump_delay_s + twin.pump_lag_s, abs=0.04)
+    assert found["laser_noise_um"] == pytest.approx(twin.laser_noise_um, rel=0.1)
+    assert found["barometer_noise_pa"] == pytest.approx(twin.barometer_noise_pa, rel=0.2)
+    assert found["thermometer_noise_k"] == pytest.approx(twin.thermometer_noise_k, rel=0.2)
+    assert 0.05 < found["pressure_walk_pa_per_root_s"] < 2.0
+    assert 0.0005 < found["air_walk_k_per_root_s"] < 0.02
+    path = tmp_path / "lab.toml"
+    path.write_text('[estimator] # all\nprocess_value = "estimate"\n')
+    words = ["tune", "save", str(done.path), "--config", str(path), "--yes"]
+    assert command_line(words) == Exit.DONE
+    saved = tomllib.loads(path.read_text())["estimator"]
+    changed = {key: value for key, value in found.items() if value != getattr(EstimatorConfig(), key)}
+    assert saved == {"process_value": "estimate"} | changed
+    capsys.readouterr()
+    assert command_line(words) == Exit.DONE
+    assert "already has the noise levels" in capsys.readouterr().out
+
+
+def test_gains_are_not_designed_for_a_loop_that_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = Config(estimator=EstimatorConfig(process_value="estimate"))
+    made = create_session(tmp_path, "s", "eve", "a-run", config, config.loop)
+    tune._do_all(["design", "apply"], made, None, None, Progress())  # type: ignore[arg-type]  # are not reached
+    assert f"`membrane-ctrl tune save {made.path} --config FILE`" in capsys.readouterr().err
+    with pytest.raises(RejectedError, match="apply: the hold follows the estimate"):
+        tune._do_all(["apply"], made, None, None, Progress())  # type: ignore[arg-type]
+
+
+def test_a_hold_without_a_laser_is_not_tuned_and_told_what_it_needs_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = '[estimator]\nprocess_value = "optics"\n[shape]\nmode = "track"\n'
+    assert tune_twin(tmp_path / "logs", "run", "--yes", config=config) == Exit.BAD_INPUT
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "uses none (estimator.process_value); it learns its noise levels by itself" in line
 
 
 @pytest.mark.parametrize("name", ["experiments.npz", "experiments.json", "identified.json"])
