@@ -9,6 +9,7 @@ between two sets.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -97,12 +98,21 @@ class Budget:
 
     def sizes(self, covariance_mm2: FloatArray) -> dict[str, float]:
         """1 sigma of the sag, and over the disc of the height and of the figure (the height without its plane)."""
-        heights, plane = propagate.disc(self.disc)
         gradient = sag_gradient()
-        sizes = {"sag_um": math.sqrt(max(float(gradient @ covariance_mm2 @ gradient), 0.0))}
-        for name, basis in (("height_rms_um", heights), ("figure_rms_um", propagate.without_plane(heights, plane))):
-            sizes[name] = math.sqrt(max(float(np.sum((basis @ covariance_mm2) * basis)) / len(basis), 0.0))
-        return {name: 1e3 * size for name, size in sizes.items()}
+        of_height, of_figure = _mean_products(self.disc)
+        squares = {
+            "sag_um": gradient @ covariance_mm2 @ gradient,
+            "height_rms_um": np.sum(of_height * covariance_mm2),
+            "figure_rms_um": np.sum(of_figure * covariance_mm2),
+        }
+        return {name: 1e3 * math.sqrt(max(float(square), 0.0)) for name, square in squares.items()}
+
+
+@lru_cache
+def _mean_products(disc: float) -> tuple[FloatArray, FloatArray]:
+    """Means (36, 36) over a disc of products of two parameters' heights, and of their figures."""
+    heights, plane = propagate.disc(disc)
+    return tuple(basis.T @ basis / len(basis) for basis in (heights, propagate.without_plane(heights, plane)))
 
 
 def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float = 1.0) -> Iterator[Source]:
