@@ -44,7 +44,7 @@ kernels: $(STAMP)  # compiled first, so that real-time tests do not wait for it
 	$(BIN)/membrane-ctrl measure build/kernels --no-pictures
 
 # per worker: more threads would only wait for each other
-fast: export OPENBLAS_NUM_THREADS = 1
+fast real_time: export OPENBLAS_NUM_THREADS = 1
 fast: $(STAMP)
 	$(BIN)/pytest -m "not campaign and not real_time" -n 2 --dist loadfile
 

@@ -112,7 +112,8 @@ class Budget:
 def _mean_products(disc: float) -> tuple[FloatArray, FloatArray]:
     """Means (36, 36) over a disc of products of two parameters' heights, and of their figures."""
     heights, plane = propagate.disc(disc)
-    return tuple(basis.T @ basis / len(basis) for basis in (heights, propagate.without_plane(heights, plane)))
+    figure = propagate.without_plane(heights, plane)
+    return heights.T @ heights / len(heights), figure.T @ figure / len(figure)
 
 
 def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float = 1.0) -> Iterator[Source]:
