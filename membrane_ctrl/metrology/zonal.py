@@ -226,7 +226,10 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
         _scatter(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
         return sums
 
-    count, x, y = np.sum(split(run, field.shape[1]), axis=0)
+    sums, *others = split(run, field.shape[1])
+    for other in others:  # in place: here a measurement takes the most memory
+        sums += other
+    count, x, y = sums
     safe = np.where(count > 0, count, 1.0)
     return ResidualGrid(axis, x / safe, y / safe, count)
 
