@@ -113,6 +113,8 @@ class WebConfig(Section):
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> "WebConfig":
+        if (self.certificate_file is None) != (self.key_file is None):
+            raise ValueError("certificate and key: give both files, or none")
         if self.host not in LOCAL_HOSTS and not (self.secure and self.users_file):
             raise ValueError(
                 f"host {self.host}: other machines need TLS and a login; give a certificate, its key and users"

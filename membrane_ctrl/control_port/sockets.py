@@ -205,7 +205,8 @@ def load_authority(context: ssl.SSLContext, authority: Path) -> None:
 def listen_tcp(host: str, port: int, field: str) -> socket.socket:
     """A listening socket. Raises DeviceError naming the configuration's field."""
     try:
-        listener = socket.create_server((host, port), backlog=endpoint.BACKLOG)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family, backlog=endpoint.BACKLOG)
     except OSError as error:
         reason = os_reason(error)
         raise DeviceError(f"{field}: cannot listen on {host}:{port} ({reason})") from None

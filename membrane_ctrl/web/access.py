@@ -196,9 +196,11 @@ class LoginMiddleware:
             user = await asyncio.to_thread(self._accounts.by_password, name, password)
             said = "Name or password is wrong, or there were too many wrong ones: wait a minute."
         else:
-            query = parse_qs(scope["query_string"].decode("latin-1"))
-            user = self._accounts.by_link(query.get("key", [""])[0])
+            secret = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
+            user = self._accounts.by_link(secret)
             said = "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
+            if secret and not self._accounts.users:
+                said = f"This link is wrong, or of an earlier start. {said}"
         if user is not None:
             headers = [(b"location", b"/"), (b"set-cookie", self._accounts.cookie(user).encode())]
             await _answer(scope, send, HTTPStatus.SEE_OTHER, "", headers)
@@ -212,7 +214,8 @@ Header = tuple[bytes, bytes]
 _HEADERS: tuple[Header, ...] = (
     (b"x-frame-options", b"DENY"),  # no other page may lay itself over the stop button
     (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),  # the link's secret stays here
+    # the link's secret stays here; with `no-referrer` a browser would send the login form with the origin `null`
+    (b"referrer-policy", b"same-origin"),
 )
 
 

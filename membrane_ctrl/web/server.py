@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import ssl
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from nicegui import app, ui
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from membrane_ctrl.config.port import LOCAL_HOSTS, WebConfig
+from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
@@ -39,9 +41,18 @@ def accounts_of(page: WebConfig) -> Accounts:
     return Accounts(users, secure=page.secure)
 
 
+def require_servable(page: WebConfig) -> None:
+    """Raise InputError for files that are no certificate and its key, DeviceError for an address that is taken."""
+    if page.certificate_file is not None and page.key_file is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        sockets.load_pair(context, Path(page.certificate_file), Path(page.key_file))
+    sockets.listen_tcp(page.host, page.port, "web").close()
+
+
 def serve(holds: dict[str, Where], page: WebConfig) -> None:
-    """Serve the page of holds, by name, until interrupted. Raises InputError for a users file that is wrong."""
+    """Serve the page of holds, by name, until interrupted. Raises as `accounts_of` and `require_servable`."""
     accounts = accounts_of(page)
+    require_servable(page)
     os.nice(max(0, _NICE - os.nice(0)))
     hosts = frozenset({*LOCAL_HOSTS, page.host, *page.names})
     feeds = {name: HoldFeed(where) for name, where in holds.items()}
@@ -79,7 +90,8 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         return report_page(logs, name)
 
     scheme = "https" if page.secure else "http"
-    link = f"{scheme}://{page.host}:{page.port}/" + ("" if accounts.users else f"?key={accounts.secret}")
+    host = f"[{page.host}]" if ":" in page.host else page.host
+    link = f"{scheme}://{host}:{page.port}/" + ("" if accounts.users else f"?key={accounts.secret}")
     print(f"membrane-ctrl web: open {link}", file=sys.stderr, flush=True)
     ui.run(
         host=page.host,

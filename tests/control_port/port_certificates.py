@@ -55,3 +55,13 @@ class Authority:
     @property
     def own(self) -> Path:
         return self.folder / "ca.pem"
+
+
+def tls_fleet(file: Path, holds: dict[str, tuple[str, str, str]]) -> Path:
+    """A fleet file of holds: address, files of the client's certificate without suffix, and the authority's file."""
+    file.write_text("".join(
+        f'[[holds]]\nname = "{name}"\ntls = "{tls}"\ncertificate_file = "{pair}.pem"\nkey_file = "{pair}.key"\n'
+        f'authority_file = "{authority}"\n'
+        for name, (tls, pair, authority) in holds.items()
+    ))  # fmt: skip
+    return file

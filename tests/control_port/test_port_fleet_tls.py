@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from pathlib import Path
 
 import pytest
-from port_certificates import Authority
+from port_certificates import Authority, tls_fleet
 from port_run import PATIENCE_S, PortRun, port_run
 
 from membrane_ctrl.cli import run as command
@@ -89,13 +89,7 @@ def fleet_file(lab: Path, ports: dict[str, int], runs: list[PortRun]) -> Path:
         "lost-key": (there, nobody, "lab/ca.pem"),
     }
     shutil.copy(lab / "lab" / "ann.pem", lab / "lab" / "lost.pem")
-    file = lab / "fleet.toml"
-    file.write_text("".join(
-        f'[[holds]]\nname = "{name}"\ntls = "{tls}"\ncertificate_file = "{pair}.pem"\nkey_file = "{pair}.key"\n'
-        f'authority_file = "{authority}"\n'
-        for name, (tls, pair, authority) in holds.items()
-    ))  # fmt: skip
-    return file
+    return tls_fleet(lab / "fleet.toml", holds)
 
 
 async def test_the_terminal_has_a_line_of_each(

@@ -72,12 +72,14 @@ class Tab:
 
 
 @asynccontextmanager
-async def browser_tab(url: str, folder: Path, width: int = 1500, height: int = 1000) -> AsyncIterator[Tab]:
+async def browser_tab(
+    url: str, folder: Path, width: int = 1500, height: int = 1000, *flags: str
+) -> AsyncIterator[Tab]:
     """A tab of a new Chromium on a page; `folder` takes its profile."""
     assert CHROMIUM is not None
     process = await asyncio.create_subprocess_exec(
         CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
-        f"--window-size={width},{height}", f"--user-data-dir={folder}", "about:blank",
+        f"--window-size={width},{height}", f"--user-data-dir={folder}", *flags, "about:blank",
         stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
     )  # fmt: skip
     try:

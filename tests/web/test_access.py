@@ -22,6 +22,7 @@ class Site:
 
     def __init__(self, accounts: Accounts) -> None:
         self.seen: list[WebUser] = []
+        self.said = ""  # to the last request
         self._gate = LoginMiddleware(self._app, accounts, HOSTS)
 
     async def _app(self, scope: Any, receive: Any, send: Any) -> None:
@@ -48,6 +49,7 @@ class Site:
 
         await self._gate(scope, receive, send)
         first = sent[0]
+        self.said = b"".join(message.get("body", b"") for message in sent).decode()
         answered = {name.decode(): value.decode() for name, value in first.get("headers", ())}
         return int(first.get("status") or first["code"]), answered
 
@@ -60,7 +62,10 @@ async def test_the_link_lets_in_and_its_session_stays() -> None:
     accounts = Accounts({})
     site = Site(accounts)
     assert (await site.ask())[0] == 401
-    assert (await site.ask(query="key=wrong"))[0] == 401
+    assert "this link is wrong" not in site.said.lower()
+    status, headers = await site.ask(query="key=wrong")
+    assert (status, "This link is wrong, or of an earlier start." in site.said) == (401, True)
+    assert headers["referrer-policy"] == "same-origin", "with none, browsers send the login form's origin as null"
     status, headers = await site.ask(query=f"key={accounts.secret}")
     assert status == 303
     assert headers["location"] == "/"
