@@ -275,5 +275,12 @@ class EstimatorConfig(Section):
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
     """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak that changes slowly:
     it then follows sooner and passes more noise."""
+    stand_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
+    """Sag that the optics see too much for each kelvin by which their stand is warmer; it is taken out.
+    Set it to the measured one: a steel stand is near 0.34 at 2.7 m, invar near 0.03."""
+    stand_sigma_um_per_k: Annotated[float, Field(ge=0, le=100)] = 0.4
+    """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a stand that was measured."""
+    stand_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
+    """Time constant with which the stand follows the air. Change it for a lighter or heavier stand."""
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
     """Walk of the laser's mount: 0.2 um in an hour. Change it to your mount's."""

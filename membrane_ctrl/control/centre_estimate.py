@@ -1,4 +1,4 @@
-"""What the filter of the mirror's centre takes and gives, and the gas between pump and mirror."""
+"""What the filter of the mirror's centre takes and gives; the gas between pump and mirror; the optics' stand."""
 
 import math
 from collections import deque
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from itertools import islice
 
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.config.control import EstimatorConfig
+from membrane_ctrl.control.filters import LowPass, smoothing
 
 
 class Sensor(IntEnum):
@@ -85,6 +86,45 @@ class CentreEstimate:
             if view.fresh
         }
         return {"estimate_sigma_um": self.sigma_um, "optics_share": self.sensors[Sensor.OPTICS].share, **told}
+
+
+class StandGrowth:
+    """The sag that the optics see too much because their stand has become warmer since the lock.
+
+    Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's zero drifts more.
+    What is known of it comes from the air's temperature, which the stand follows late.
+    """
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self._um_per_k, self._sigma_um_per_k = config.stand_um_per_k, config.stand_sigma_um_per_k
+        self._stand_c = LowPass(config.stand_follows_air_s)
+        self._locked_c = math.nan
+
+    def lock(self) -> None:
+        """From now on the present temperature is that of the reference."""
+        self._locked_c = self._stand_c.value
+
+    def step(self, air_c: float, dt_s: float) -> None:
+        """Follow the air's temperature; NaN without a good reading."""
+        if math.isfinite(air_c):
+            self._stand_c.update(air_c, dt_s)
+            if math.isnan(self._locked_c):
+                self.lock()
+
+    @property
+    def warmed_k(self) -> float:
+        """By how much the stand is warmer than at the lock; 0 if unknown."""
+        return 0.0 if math.isnan(self._locked_c) else self._stand_c.value - self._locked_c
+
+    @property
+    def um(self) -> float:
+        """What the sag shows too much."""
+        return self._um_per_k * self.warmed_k
+
+    @property
+    def sigma_um(self) -> float:
+        """Standard deviation of that."""
+        return self._sigma_um_per_k * abs(self.warmed_k)
 
 
 class Transit:

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import film, film_health, gas, inner_loop
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
-from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.scene import Scene
@@ -196,6 +196,7 @@ def _of_warning(warning: film_health.FilmWarning) -> Event:
 
 # in `inflate` the film's gain may still be another one
 _ESTIMATED = frozenset({State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
+_STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
 _STANDS_S = 1.0  # a sensor that comes and goes within this is not reported
 
 
@@ -204,11 +205,14 @@ class Holders:
 
     def __init__(self, config: Config) -> None:
         self._wanted = config.estimator.process_value != "laser"
+        self._by_optics = config.by_optics
         self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
         self._filter = CentreFilter(config.estimator, config.loop)
         self._running = self._locking = False
         # while laser and camera agree: what the filter then gave to the mount was the film's, if the camera was wrong
         self._agreed_mount = LowPass(film.REFERENCE_S)
+        self._stand = StandGrowth(config.estimator)
+        self._stand_most_um, self._stand_told = _STAND_SHARE * config.limits.band_um, False
         self._told: tuple[int, ...] | None = None
         self._news_s = math.nan
         self.estimate: CentreEstimate | None = None
@@ -236,8 +240,7 @@ class Holders:
         if not self._wanted or state not in _ESTIMATED or not math.isfinite(flow_um_per_s):
             self.estimate, self._running, self._told = None, False, None
             return []
-        by_optics = math.isfinite(self._sag_zero_um)
-        laser_um = math.nan if by_optics or consistency.laser_lies else seen_um
+        laser_um = math.nan if self._by_optics or consistency.laser_lies else seen_um
         if not self._running:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
@@ -245,7 +248,8 @@ class Holders:
             self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._sag_zero_um)
             self._running = True
             self._agreed_mount.reset(scene.trim_um)
-        off = shape == ShapeState.OFF and not by_optics
+            self._stand.lock()
+        off = shape == ShapeState.OFF and not self._by_optics
         if off:
             self._locking = True
         elif self._locking:
@@ -253,25 +257,47 @@ class Holders:
             self._locking = False
         if consistency.agree and self.estimate is not None:
             self._agreed_mount.update(self.estimate.mount_um, scene.dt_s)
-        elif consistency.camera_lies and self._filter.frames:
+        elif consistency.camera_lies and self._filter.frames and not self._by_optics:
             self._filter.blame_optics(self._agreed_mount.value)
         figure = inputs.estimate
         if off or consistency.camera_lies or (figure and figure.verdict == "rejected"):
             figure = None
         reading = inputs.reading
+        self._stand.step(
+            gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan, scene.dt_s
+        )
+        if self._filter.frames < LOCK_FRAMES:
+            self._stand.lock()
         readings = CentreReadings(
             now_s=inputs.now_s,
             flow_um_per_s=flow_um_per_s,
             laser_um=laser_um,
             ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
             air_temperature_c=reading.air_temperature_c if reading else math.nan,
-            sag_um=figure.sag_um if figure else math.nan,
+            sag_um=figure.sag_um - self._stand.um if figure else math.nan,
             sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
             sag_time_s=figure.time_s if figure else math.nan,
         )
         self.estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = self.estimate.mount_um
-        return self._news(inputs.now_s, self.estimate.jumped)
+        news = [*self._news(inputs.now_s, self.estimate.jumped), *self._told_of_stand()]
+        if self._sees(Sensor.OPTICS):
+            sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
+            self.estimate = replace(self.estimate, sigma_um=sigma_um)
+        return news
+
+    def _told_of_stand(self) -> list[Event]:
+        """Report once that the optics may be off by the growth of their stand, and once that a new lock ended it."""
+        sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
+        far = sigma_um > self._stand_most_um / (2 if self._stand_told else 1)
+        if far == self._stand_told:
+            return []
+        self._stand_told = far
+        stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
+        if not far:
+            return [MaintenanceOver("stand_growth", stands)]
+        anew = "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
+        return [Maintenance("stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} um; {anew}")]
 
     def _sees(self, sensor: Sensor) -> bool:
         return self.estimate is not None and self.estimate.sensors[sensor].fresh

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import Config
+from membrane_ctrl.config.schema import Config, EstimatorConfig
 from membrane_ctrl.controller.sensor_consistency import HoldStatus, SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
@@ -18,8 +18,8 @@ SAG_UM = 37_100.0
 class Seconds:
     """A held mirror, a tick a second."""
 
-    def __init__(self) -> None:
-        self.consistency = SensorConsistency(Config())
+    def __init__(self, config: Config = Config()) -> None:  # noqa: B008 (frozen)
+        self.consistency = SensorConsistency(config)
         self.now_s = 0.0
         self.camera_stuck = False
         self.events: list[Event] = []
@@ -75,6 +75,16 @@ def test_a_camera_that_sees_the_film_stand_still_explains_it_until_it_is_gone() 
     assert mirror.consistency.gas_excess == ""
     mirror.pass_by(100, leak_um_per_s=6.7)
     assert mirror.consistency.gas_excess != ""
+
+
+def test_a_camera_that_holds_the_mirror_by_itself_is_no_witness_of_its_gas() -> None:
+    """Optics that drift make the loop pump against them, as a laser that creeps does."""
+    mirror = Seconds(Config(estimator=EstimatorConfig(process_value="optics")))
+    mirror.pass_by(600, camera=True)
+    mirror.pass_by(300, leak_um_per_s=3.0, camera=True)
+    assert mirror.consistency.gas_excess != ""
+    mirror.pass_by(60, gauge_pa=605.0, camera=True)
+    assert mirror.consistency.laser_gauge_apart.startswith("optics ")
 
 
 def test_laser_and_gauge_are_compared_wherever_the_pump_may_run() -> None:
