@@ -38,6 +38,7 @@ NAMES = (
     "calibration",
     "calibration_time",
     "coverage",
+    "calibration_coverage",
     "benches",
     "recording",
     "memory",

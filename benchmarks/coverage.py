@@ -125,8 +125,8 @@ def stated_sigmas(stated: OpticsConfig) -> SigmasConfig:
     return stated.geometry.sigmas or SigmasConfig()
 
 
-def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> OpticsConfig:
-    """The bench as it really is, grown since it was measured."""
+def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> tuple[OpticsConfig, dict[str, float]]:
+    """The bench as it really is, grown since it was measured; and by how much each input was stated wrong."""
     spread, _ = spread_of(stated, None)
     off = dict(zip(spread.names, spread.draw(rng), strict=True))
     there = bench_at(Geometry.from_config(stated), np.array([off.get(name, 0.0) for name in NAMES]))
@@ -140,25 +140,42 @@ def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> OpticsConfig:
         s_y=tuple(geometry.screen_s_y),
         bow_mm=off["bow_mm"],
     )
-    lens = {"focal_mm": geometry.focal_px * CAMERA.pixel_um * 1e-3, "principal_px": geometry.principal_px}
-    return OpticsConfig(
+    lens = {"focal_mm": geometry.focal_px * stated.camera.pixel_um * 1e-3, "principal_px": geometry.principal_px}
+    optics = OpticsConfig(
         geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
-        camera=CAMERA.model_copy(update={**lens, "distortion": geometry.distortion}),
+        camera=stated.camera.model_copy(update={**lens, "distortion": geometry.distortion}),
         pattern=stated.pattern.model_copy(update={"period_mm": stated.pattern.period_mm * there.pitch}),
     )
+    return optics, off
 
 
+@dataclass
 class Room:
-    """Light, blur, laser, dust and the film's motion of one bench, drawn once for both of its sets."""
+    """Light, blur, laser, dust and the film's motion of one bench, the same for all of its sets."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.gamma = float(rng.choice([1.0, rng.uniform(1.0, 2.2)]))
-        self.flicker = float(rng.choice([0.0, rng.uniform(0.0, 0.015)]))
-        self.ambient = float(rng.choice([0.0, rng.uniform(0.0, 0.05)]))
-        self.blur_px = float(rng.choice([0.0, rng.uniform(0.0, 8.0)]))
-        self.laser = bool(rng.random() < 0.6)
-        self.moves_um = float(rng.choice([0.5, rng.uniform(1.0, 30.0)]))
-        self.dust, self.stale = bool(rng.random() < 0.3), bool(rng.random() < 0.1)
+    gamma: float
+    flicker: float
+    ambient: float
+    blur_px: float
+    laser: bool
+    moves_um: float
+    dust: bool
+    stale: bool
+    mean_um: float = 0.0  # of the film in the last set
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Room:
+        """At random."""
+        return cls(
+            gamma=float(rng.choice([1.0, rng.uniform(1.0, 2.2)])),
+            flicker=float(rng.choice([0.0, rng.uniform(0.0, 0.015)])),
+            ambient=float(rng.choice([0.0, rng.uniform(0.0, 0.05)])),
+            blur_px=float(rng.choice([0.0, rng.uniform(0.0, 8.0)])),
+            laser=bool(rng.random() < 0.6),
+            moves_um=float(rng.choice([0.5, rng.uniform(1.0, 30.0)])),
+            dust=bool(rng.random() < 0.3),
+            stale=bool(rng.random() < 0.1),
+        )
 
     def causes(self) -> list[str]:
         """What is wrong with the sets."""
@@ -167,11 +184,13 @@ class Room:
         named |= {"dust": self.dust, "stale frame": self.stale}
         return [name for name, there in named.items() if there]
 
-    def stack(self, render: Callable[[Any, float, float], FloatArray], rng: np.random.Generator) -> FrameStack:
+    def stack(
+        self, render: Callable[[Any, float, float], FloatArray], rng: np.random.Generator, bits: int = 8
+    ) -> FrameStack:
         """A set whose film moves by a random walk about its mean."""
         shown = pattern_sequence("full", OpticsConfig().pattern)
         where_um = self.moves_um * np.cumsum(rng.standard_normal(len(shown))) / math.sqrt(len(shown))
-        where_um += rng.uniform(-20.0, 20.0)
+        where_um += rng.uniform(-20.0, 20.0) * (self.moves_um > 0)
         white = render(shown[-2], 0.0, 1.0)
         frames = []
         for k, (pattern, place_um) in enumerate(zip(shown, where_um, strict=True)):
@@ -179,7 +198,7 @@ class Room:
             frame = frame + self.ambient * white / 2 * k / len(shown)
             if self.blur_px:
                 frame = cv2.GaussianBlur(frame, (0, 0), self.blur_px / SHRINK)
-            frames.append(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
+            frames.append(np.clip(np.rint(frame), 0, 2**bits - 1).astype(np.uint8 if bits == 8 else np.uint16))
         if self.dust:
             for row, column in rng.integers(20, 230, (20, 2)):
                 for frame in frames[:: rng.integers(1, 3)]:
@@ -246,7 +265,7 @@ def bench(seed: int) -> dict[str, Any]:
     law = np.random.default_rng((2027, seed))
     slack, poisson = 10 ** law.uniform(-5, -3) * law.integers(2), law.uniform(0.25, 0.45)
     film = typical_film(37.1, 500.0, seed, slack, poisson)
-    there, room, sigmas = true_bench(stated, rng), Room(rng), stated_sigmas(stated)
+    (there, _), room, sigmas = true_bench(stated, rng), Room.drawn(rng), stated_sigmas(stated)
     air_k_per_m, glass_mm = rng.standard_normal(2) * (sigmas.air_k_per_m, sigmas.glass_mm)
     renderer = BentRays(
         there, film, Light(gamma=room.gamma), seed=seed, air_k_per_m=air_k_per_m, glass_mm=abs(glass_mm)

@@ -29,9 +29,10 @@ def report_of(
     }
     if solution is None or not solution.converged:
         return table
-    middle = len(solution.states) // 2
+    middle = solution.problem.middle
     claim = propagate.propagate(solution, middle, analysis_radius_mm)
     scale, advice = diagnose.laser_scale(solution), propagate.advice(solution, middle)
+    artefact = propagate.artefact_advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
         "condition": propagate.condition_number(solution),
@@ -47,6 +48,7 @@ def report_of(
             "zernike_um": claim.zernike_um.tolist(),
         },
         "advice": None if advice is None else asdict(advice),
+        "artefact_advice": None if artefact is None else asdict(artefact),
         "film": solution.problem.references.film,
         "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},
@@ -69,6 +71,7 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
     return [
         {
             "name": phases.name,
+            "surface": "film" if phases.artefact is None else phases.artefact.name,
             "displacement_um": phases.displacement_um if np.isfinite(phases.displacement_um) else None,
             "sag_mm": state.surface.sag_mm,
             "noise_ratio": float(np.sqrt(linear.variance)),
@@ -97,6 +100,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     lines.append("set                 reading um   sag mm    noise  residual um  against the others")
     for row in report["sets"]:
         reading = "-" if row["displacement_um"] is None else f"{row['displacement_um']:.1f}"
+        reading = reading if row["surface"] == "film" else row["surface"]
         lines.append(
             f"{row['name']:<18}{reading:>12}{row['sag_mm']:>10.4f}{row['noise_ratio']:>8.2f}"
             f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of {row['left_out_freedom']} expected"
@@ -110,6 +114,14 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         unit = parameters.ALL[parameters.NAMES.index(advice["name"])].unit
         known = f"{advice['sigma']:.2g} {unit}".strip()
         lines.append(f"best next: {advice['name']} known to {known} would give sag +- {advice['sag_um']:.2g} um")
+    if (sphere := report["artefact_advice"]) is not None:
+        together = " and ".join(sphere["together"][:2])
+        lines.append(
+            (f"{together} cannot be told apart here: put" if together else "better: put")
+            + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
+            f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
+            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} um"
+        )
     if report["laser"]["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")

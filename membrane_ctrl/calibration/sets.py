@@ -17,43 +17,59 @@ from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
+from membrane_ctrl.metrology.bins import BinGrid
 from membrane_ctrl.metrology.calibrate import drift, propagate, residuals, ring_pose, separable, verdict
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
 from membrane_ctrl.metrology.calibrate.solve import Origin, Problem, Solution, slope_residual, solve, tables_of
 from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.full import LASER_NOISE_UM, bin_figure
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.phase import mm_per_rad, phase_sigma_rad
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
 
+_NO_FILM = "an artefact, as all sets are: a calibration needs a set of the film, whose figure it is for"
+_MOTION_UNSEEN_UM = 100.0  # without a laser; the fringes find it to some micrometres
+
 
 def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
-    """The bins within the analysis radius that the set's own fit kept.
+    """The bins within the analysis radius that the set's own fit kept, corrected for the film's motion.
 
     The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
     which no calibration changes).
     """
-    state, bin_px = checked.state, checked.binned.bin_px
-    grid = BinGrid(checked.tracer.geometry, optics.camera, bin_px)
-    scale = mm_per_rad(optics.pattern)
-    phase = checked.phase_rad.reshape(2, -1)[:, state.index]
-    swing = checked.view.swing_adu.reshape(2, -1)[:, state.index]
-    pixel = pixel_sigma_adu(optics.camera.noise_adu)
-    per_adu = [phase_sigma_rad(checked.stack.shifts_rad(used), pixel, 1.0) for used in checked.view.used]
-    variance = np.mean(np.square(np.array(per_adu)[:, None] / swing), axis=0)
+    motion_um, sigma_um = _motion_um(checked)
+    figure = bin_figure(optics, checked, motion_um)
+    grid = BinGrid(checked.tracer.geometry, optics.camera, checked.binned.bin_px)
     return residuals.SetPhases(
         name=name,
-        column_px=grid.column_px[state.index],
-        row_px=grid.row_px[state.index],
-        screen_mm=phase * scale - state.offset_mm,
-        sigma_mm=np.sqrt(variance) * scale / bin_px,
+        column_px=grid.column_px[figure.index],
+        row_px=grid.row_px[figure.index],
+        screen_mm=figure.points.screen_mm,
+        sigma_mm=np.sqrt(np.mean(np.square(figure.sigma_mm), axis=0)),
         displacement_um=checked.stack.mean_reading_um,
+        motion_sigma_um=sigma_um,
+        moved_um=float(np.std(np.concatenate(motion_um))),
     )
+
+
+def _motion_um(checked: Checked) -> tuple[tuple[FloatArray, FloatArray], float]:
+    """Motion of the film during the x and the y frames, and how well the difference of their means is known.
+
+    The fringes see it from frame to frame of one axis, to a tenth of a micrometre, where the laser's noise is one. Of
+    a difference between the axes they make a figure: there the laser counts.
+    """
+    x, y = checked.view.used
+    seen = [axis - axis.mean() for axis in (checked.film_um[: len(x)], checked.film_um[len(x) :])]
+    told = [float(checked.stack.displacement_um[used].mean()) for used in (x, y)]
+    if not all(math.isfinite(mean) for mean in told):
+        return (seen[0], seen[1]), _MOTION_UNSEEN_UM
+    mean_um = checked.stack.mean_reading_um
+    sigma_um = LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
+    return (seen[0] + told[0] - mean_um, seen[1] + told[1] - mean_um), sigma_um
 
 
 def edges_of(figure: SetFigure) -> FloatArray | None:
@@ -162,20 +178,25 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     edges: list[FloatArray] = []
     for folder in terminal.counted(folders, "sets"):
         figure = figures.of(folder)
+        phases = phases_of(folder.name, figure.checked, figure.head.optics)
+        sets.append(replace(phases, artefact=figure.head.artefact))
         benches.append(figure.head.optics)
-        _same_rig(folders[0], benches[0], folder, benches[-1])
-        sets.append(phases_of(folder.name, figure.checked, figure.head.optics))
-        if (seen := edges_of(figure)) is not None:
+        first = next((k for k, phases in enumerate(sets) if phases.artefact is None), 0)
+        _same_rig(folders[first], benches[first], folder, benches[-1], sets[first].artefact is figure.head.artefact)
+        if figure.head.artefact is None and (seen := edges_of(figure)) is not None:
             edges.append(seen)
         files = figure.head.files
         notes += [f"{folder.name}: {files[flag.frame]} omitted: {flag.reason}" for flag in figure.checked.flags]
-    reference_um = _reference_um(sets, benches, reference_um)
-    if not any(math.isfinite(phases.displacement_um) for phases in sets):
+    films = [k for k, phases in enumerate(sets) if phases.artefact is None]
+    if not films:
+        raise errors.InputError(f"{folders[0]}: {_NO_FILM}")
+    reference_um = _reference_um([sets[k] for k in films], [benches[k] for k in films], reference_um)
+    if not any(math.isfinite(sets[k].displacement_um) for k in films):
         # no laser: the world's origin is the vertex of the first set
-        sets[0] = replace(sets[0], displacement_um=reference_um)
+        sets[films[0]] = replace(sets[films[0]], displacement_um=reference_um)
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
-    return Bundle(tuple(sets), benches[0], reference_um, tuple(notes), tuple(edges))
+    return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), tuple(edges))
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
@@ -201,8 +222,9 @@ def _reference_um(
     return next((phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0)
 
 
-def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig) -> None:
-    for section in ("camera", "mirror", "pattern", "geometry"):
+def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig, films: bool) -> None:
+    """Raises InputError for a set of another bench; an artefact has another size than the mirror."""
+    for section in ("camera", "pattern", "geometry", *(("mirror",) if films else ())):
         ours, theirs = getattr(optics, section), getattr(other, section)
         for field in type(ours).model_fields:
             if field in ("reference_displacement_um", "steps", "noise_adu"):
@@ -238,7 +260,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
         raise errors.InputError(str(error)) from None
     references = separable.References(bundle.reference_um, options.laser_sigma_um, film=options.film)
     radius_mm = bundle.optics.mirror.radius_mm
-    if sum(math.isfinite(phases.displacement_um) for phases in bundle.sets) < 2:
+    if sum(math.isfinite(p.displacement_um) for p in bundle.sets if p.artefact is None) < 2:
         known[LASER.name] = 0.0  # no readings to scale
     rim = Rim.of(bundle.edges_px, radius_mm, options.radius_sigma_mm)
     return Problem(geometry, bundle.sets, sigmas(known), references, radius_mm, rim)
@@ -248,10 +270,11 @@ def _write(
     path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[verdict.CalibrationFinding]
 ) -> str:
     """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
-    slopes = [slope_residual(solution, phases, k) for k, phases in enumerate(problem.sets)]
+    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
+    slopes = [slope_residual(solution, problem.sets[k], k) for k in problem.films]
     noises = [
         drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
-        for state, phases in zip(solution.states, problem.sets, strict=True)
+        for state, phases in films
     ]
     origin = Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),

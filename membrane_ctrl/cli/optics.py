@@ -203,6 +203,12 @@ def simulate(
         list[float] | None,
         typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable."),
     ] = None,
+    artefact: Annotated[
+        str,
+        typer.Option(
+            metavar="FORM", help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in the mirror's place, mm."
+        ),
+    ] = "",
     track: Annotated[
         int, typer.Option(min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full.")
     ] = 0,
@@ -231,6 +237,7 @@ def simulate(
         sets=sets,
         interval_s=interval_s,
         coarser_mm=tuple(coarser_mm or ()),
+        artefact=artefact,
         track=track,
         rate_hz=rate_hz,
     )

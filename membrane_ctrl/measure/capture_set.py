@@ -21,6 +21,7 @@ from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
+from membrane_ctrl.metrology.optics.surface import Artefact
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
@@ -45,6 +46,35 @@ class FrameRow(Section):
     displacement_um: float | None = None
 
 
+_Length = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class ArtefactTable(Section):
+    """The `[artefact]` table: what stands in the mirror's place."""
+
+    form: Literal["flat", "sphere"]
+    curvature_radius_mm: _Length | None = None  # of a concave sphere
+    curvature_radius_sigma_mm: _Length | None = None
+    form_sigma_um: Annotated[float, Field(ge=1e-3, le=1e3)] = 0.1  # of each Zernike term
+    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0  # above the film's vertex at the reference displacement
+    vertex_sigma_mm: _Length = 1.0
+
+    def artefact(self, radius_mm: float, path: Path) -> Artefact:
+        """The surface, over its disc. Raises InputError."""
+        curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
+        for name, value in (("curvature_radius_mm", curvature), ("curvature_radius_sigma_mm", spread)):
+            if (value is None) != (self.form == "flat"):
+                says = "a sphere needs it" if value is None else "a flat has none"
+                raise InputError(f"{path}: artefact.{name}: {says}")
+        known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
+        known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
+        if curvature is None or spread is None:
+            return Artefact(0.0, 0.0, **known)
+        if curvature <= radius_mm:
+            raise InputError(f"{path}: artefact.curvature_radius_mm = {curvature:g} must exceed mirror.radius_mm")
+        return Artefact(1 / curvature, spread / curvature**2, **known)
+
+
 class CaptureFile(Section):
     """The content of `capture.toml`."""
 
@@ -56,6 +86,7 @@ class CaptureFile(Section):
     geometry: schema.GeometryConfig
     camera: schema.CameraConfig
     mirror: schema.MirrorConfig
+    artefact: ArtefactTable | None = None
     frames: tuple[FrameRow, ...]
 
 
@@ -75,6 +106,7 @@ class CaptureHead:
     pressure_pa: float  # gauge pressure during the set; NaN where not stated
     ignored: tuple[str, ...]  # unknown keys of the file
     geometry: GeometryOrigin  # origin of the geometry in `optics`
+    artefact: Artefact | None = None  # what stands in the mirror's place; None: the film
 
     @property
     def fringes(self) -> list[int]:
@@ -151,6 +183,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
         geometry=origin_of(optics) if geometry is None else geometry.origin,
+        artefact=None if content.artefact is None else content.artefact.artefact(content.mirror.radius_mm, path),
     )
 
 

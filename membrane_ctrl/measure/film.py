@@ -57,6 +57,8 @@ def film_command(options: FilmOptions) -> int:
     sets = [measured.of(folder) for folder in terminal.counted(options.folders, "sets")]
     mirror = sets[0].head.optics.mirror
     for one in sets:
+        if one.head.artefact is not None:
+            raise errors.InputError(f"{one.head.folder / 'capture.toml'}: artefact: a set of no film")
         if one.head.optics.mirror.radius_mm != mirror.radius_mm:
             raise errors.InputError(
                 f"{one.head.folder / 'capture.toml'}: mirror.radius_mm: not that of the first set"

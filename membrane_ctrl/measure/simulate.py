@@ -1,9 +1,12 @@
 """The `simulate` command: capture sets with known truth, from the twin's optics."""
 
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from membrane_ctrl.config.schema import Config, OpticsConfig
 from membrane_ctrl.geometry.file import read_geometry
@@ -33,6 +36,7 @@ class SimulateOptions:
     sets: int
     interval_s: float
     coarser_mm: tuple[float, ...] = ()
+    artefact: str = ""  # "flat:RADIUS" or "sphere:CURVATURE:RADIUS", mm
     track: int = 0  # frames of a tracking set
     rate_hz: float = 20.0
 
@@ -62,23 +66,67 @@ def simulate_command(options: SimulateOptions) -> int:
 def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     """The set described by the options. Raises ValueError naming an impossible one."""
     optics = _optics(options)
+    if options.artefact:
+        return _of_artefact(options, optics)
     radius_mm = optics.mirror.radius_mm
     twin = options.config.twin
     mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson)
-    return simulation_spec.SimulationSpec(
-        optics,
-        mounted if options.figure else replace(mounted, zernike_um=()),
-        kind="frequencies" if options.coarser_mm else "full",
-        coarser_mm=options.coarser_mm,
+    return replace(
+        _bare(options, optics, mounted if options.figure else replace(mounted, zernike_um=())),
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
         motion=options.motion,
         laser_noise_um=options.laser_noise_um,
+    )
+
+
+def _bare(
+    options: SimulateOptions, optics: OpticsConfig, shape: film_shape.FilmShape
+) -> simulation_spec.SimulationSpec:
+    """A set of a surface at rest."""
+    return simulation_spec.SimulationSpec(
+        optics,
+        shape,
+        kind="frequencies" if options.coarser_mm else "full",
+        coarser_mm=options.coarser_mm,
         stated_geometry=None if options.stated is None else read_geometry(options.stated).geometry,
         light=shade.Light(gamma=options.gamma),
         exact=options.exact,
         seed=options.seed,
         faults=tuple(simulation_spec.FrameFault.parse(text) for text in options.faults),
     )
+
+
+_USED = 0.95  # of the artefact's radius, as of the mirror's
+_LEANS = 2e-3  # a hand puts it down to some tenths of a millimetre
+_RADIUS_KNOWN, _VERTEX_KNOWN_MM, _FORM_KNOWN_UM = 1e-4, 0.05, 0.05  # what the file states
+
+
+def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
+    """A set of a flat or a sphere in the mirror's place, put there by hand, so that it leans.
+
+    Raises ValueError for a text that names none, and for a run of sets.
+    """
+    form, *sizes = options.artefact.split(":")
+    try:
+        curvature_mm, radius_mm = [math.inf, *map(float, sizes)][-2:]
+    except ValueError:
+        raise ValueError(f"--artefact {options.artefact}: sizes are numbers, mm") from None
+    if len(sizes) != {"flat": 1, "sphere": 2}.get(form) or not 0 < radius_mm < curvature_mm:
+        raise ValueError(f"--artefact {options.artefact}: flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS, mm")
+    if options.sets > 1 or options.track:
+        raise ValueError("--artefact: one set, which is not of a film")
+    table: dict[str, str | float] = {
+        "form": form,
+        "vertex_sigma_mm": _VERTEX_KNOWN_MM,
+        "form_sigma_um": _FORM_KNOWN_UM,
+    }
+    if form == "sphere":
+        table |= {"curvature_radius_mm": curvature_mm, "curvature_radius_sigma_mm": _RADIUS_KNOWN * curvature_mm}
+    lean_x, lean_y = np.random.default_rng(options.seed).uniform(-_LEANS, _LEANS, 2).tolist()
+    shape = simulation_spec.leaning(curvature_mm, radius_mm, lean_x, lean_y)
+    mirror = type(optics.mirror)(radius_mm=radius_mm, analysis_radius_mm=_USED * radius_mm)
+    spec = _bare(options, optics.model_copy(update={"mirror": mirror}), shape)
+    return replace(spec, artefact=table, laser=False)
 
 
 def _optics(options: SimulateOptions) -> OpticsConfig:

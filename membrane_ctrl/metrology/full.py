@@ -115,7 +115,7 @@ def _axis_phases(
     sensitivity: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
-    combined = _combination(checked, axis, sensitivity is not None)
+    combined = _combination(checked, axis, None if sensitivity is None else _told_um(checked, axis))
     every = stack.sinusoids(phase.AXES[axis])
     # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
@@ -206,12 +206,18 @@ class BinFigure:
     moved: bool  # whether the film's motion between the frames was corrected
 
 
-def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
-    """Phases of the bins, corrected for the film's motion, and the surface fitted to them."""
-    stack, state = checked.stack, checked.state
-    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
+def bin_figure(
+    optics: OpticsConfig, checked: Checked, motion_um: tuple[FloatArray, FloatArray] | None = None
+) -> BinFigure:
+    """Phases of the bins, corrected for the film's motion, and the surface fitted to them.
+
+    The motion is that of the used sinusoids of x and of y; by default what the laser saw, if it is worth it.
+    """
+    stack, state, axes = checked.stack, checked.state, range(len(phase.AXES))
+    moved = motion_um is not None or motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
     sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
-    steps = [_combination(checked, axis, moved) for axis in range(len(phase.AXES))]
+    told_um = motion_um or [_told_um(checked, axis) for axis in axes]
+    steps = [_combination(checked, axis, told_um[axis] if moved else None) for axis in axes]
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the combinations
     phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)
@@ -228,9 +234,13 @@ def bin_figure(optics: OpticsConfig, checked: Checked) -> BinFigure:
     return BinFigure(fit, points, state.index, scale * sigma, quality, moved)
 
 
-def _combination(checked: Checked, axis: int, moved: bool) -> phasor.StepCombination:
-    """How the means of the usable frames of an axis combine."""
+def _told_um(checked: Checked, axis: int) -> FloatArray:
+    """The laser's readings at the usable frames of an axis, about their mean over both."""
+    return np.asarray(checked.stack.displacement_um[checked.view.used[axis]] - checked.stack.mean_reading_um)
+
+
+def _combination(checked: Checked, axis: int, motion_um: FloatArray | None) -> phasor.StepCombination:
+    """How the means of the usable frames of an axis combine, whose film moved so."""
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)
-    motion_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um if moved else None
     return motion.combine_steps(checked.stack.weights(used), shifts, 1, motion_um)

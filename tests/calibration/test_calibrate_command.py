@@ -8,15 +8,16 @@ import shutil
 import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
-from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
 from membrane_ctrl.sim.optics.trace import ScreenError
 
 # 16-bit frames of large pixels, each with the noise of the 64 of the paper's camera that it stands for
@@ -28,6 +29,7 @@ CAMERA = CameraConfig(
 STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9)
 TRUE = GeometryConfig(a_mm=2674.0, b_mm=2869.0, alpha_deg=81.2, reference_displacement_um=0.0)
 FILM = typical_film(37.1, 500.0, seed=1)
+LEANS = ScreenError(0.5, -0.5)
 MOVED_UM = (-4000.0, -2000.0, 0.0, 2000.0, 4000.0)
 
 
@@ -42,7 +44,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
             motion=Motion(start_um=moved_um),
             laser_noise_um=1.0,
             stated_geometry=stated,
-            screen_error=ScreenError(0.5, -0.5),
+            screen_error=LEANS,
             seed=k + 1,
         )
         simulate_set(root / f"set{k}", spec)
@@ -191,3 +193,79 @@ def test_wrong_options_are_said(
 def test_a_set_given_twice_is_refused(folders: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", str(folders[0]), str(folders[0])]) == 2
     assert "given twice" in capsys.readouterr().err
+
+
+def set_of(folder: Path, film: FilmShape, mirror: MirrorConfig | None = None, **more: Any) -> Path:
+    """One more set of the bench of `folders`."""
+    optics = OpticsConfig(geometry=TRUE, camera=CAMERA, mirror=mirror or MirrorConfig())
+    stated = STATED.model_copy(update={"reference_displacement_um": 0.0})
+    simulate_set(folder, SimulationSpec(optics, film, stated_geometry=stated, screen_error=LEANS, **more))
+    return folder
+
+
+SPHERE = {"form": "sphere", "curvature_radius_mm": 3400.0, "curvature_radius_sigma_mm": 0.34, "vertex_sigma_mm": 0.05}
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    shape = leaning(3400.0, 450.0, 1e-3, -5e-4)
+    mirror = MirrorConfig(radius_mm=450.0, analysis_radius_mm=440.0)
+    return set_of(tmp_path_factory.mktemp("known") / "sphere", shape, mirror, artefact=SPHERE, laser=False)
+
+
+def test_a_sphere_beside_the_film_sharpens_the_sag(
+    folders: list[Path], sphere: Path, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = json.loads(calibrated.read_text())
+    assert alone["artefact_advice"]["sag_um"] < 0.5 * alone["uncertainty"]["sag_um"]
+    out = tmp_path / "g.toml"
+    assert run(["calibrate", str(sphere), *map(str, folders[1:4]), "--out", str(out), "--json", "--no-pictures"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [row["surface"] for row in report["sets"]] == ["sphere", "film", "film", "film"]
+    assert report["uncertainty"]["sag_um"] < 0.5 * alone["uncertainty"]["sag_um"]
+    found = {row["name"]: row for row in report["parameters"]}
+    for name, true in (("a_mm", 2.0), ("b_mm", -2.0), ("focal_relative", 0.0), ("pitch_relative", 0.0)):
+        assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"], name
+    assert tomllib.loads(out.read_text())["calibration"]["sets"] == ["sphere", "set1", "set2", "set3"]
+    # the mirror is the film's, not the sphere's
+    assert run(["measure", str(folders[2]), "--geometry", str(out), "--no-pictures", "--json"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes", "says"),
+    [
+        ("curvature_radius_sigma_mm = 0.34", "", "artefact.curvature_radius_sigma_mm: a sphere needs it"),
+        ('form = "sphere"', 'form = "flat"', "artefact.curvature_radius_mm: a flat has none"),
+        ("curvature_radius_mm = 3400.0", "curvature_radius_mm = 400.0", "must exceed mirror.radius_mm"),
+        ('form = "sphere"', 'form = "cone"', "artefact.form"),
+    ],
+)
+def test_an_artefact_that_is_not_described_is_refused(
+    sphere: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], was: str, becomes: str, says: str
+) -> None:
+    text = (sphere / "capture.toml").read_text()
+    assert was in text
+    (tmp_path / "capture.toml").write_text(text.replace(was, becomes))
+    assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "g.toml")]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_artefacts_alone_are_refused(sphere: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["calibrate", str(sphere), "--out", str(tmp_path / "g.toml")]) == 2
+    assert "a calibration needs a set of the film" in capsys.readouterr().err
+    assert run(["film", str(sphere), "--out", str(tmp_path / "film")]) == 2
+    assert "sphere/capture.toml: artefact: a set of no film" in capsys.readouterr().err
+
+
+def test_a_film_that_moves_within_its_sets_calibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A drift that brings the y frames to another bowl than the x frames; the laser saw it, with its noise."""
+    moving = []
+    for k, drift_um_per_s in enumerate((12.0, -20.0, 30.0)):
+        motion = Motion(start_um=(-4000.0, 0.0, 4000.0)[k], drift_um_per_s=drift_um_per_s)
+        moving.append(set_of(tmp_path / f"{k}", FILM, motion=motion, laser_noise_um=1.0, seed=k + 20))
+    words = ["calibrate", *map(str, moving), "--out", str(tmp_path / "g.toml"), "--json", "--no-pictures"]
+    assert run(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["findings"] == []
+    found = {row["name"]: row for row in report["parameters"]}
+    assert abs(found["alpha_deg"]["value"] - 0.3) < 4 * found["alpha_deg"]["sigma"] < 0.08

@@ -20,7 +20,15 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     poses_at,
     sigmas,
 )
-from membrane_ctrl.metrology.calibrate.residuals import COLUMNS, LOCAL, SetPhases, chunks, residual_mm
+from membrane_ctrl.metrology.calibrate.residuals import (
+    BEYOND,
+    COLUMNS,
+    LOCAL,
+    MOTION,
+    SetPhases,
+    chunks,
+    residual_mm,
+)
 from membrane_ctrl.metrology.calibrate.separable import SetState, averaged, rim_harmonics
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
@@ -57,8 +65,15 @@ def test_derivatives_are_those_of_the_model() -> None:
             numeric = (both[0] - both[1]) / 2e-3
         elif column == PARAMETERS:
             numeric = (predicted(z=z_mm + 1e-2) - predicted(z=z_mm - 1e-2)) / 2e-2
+        elif column == MOTION:  # a bowl that is deeper in the x frames, its ring at rest
+            deeper = Surface.hencky_bowl(1e-2, 500.0).parameters
+            both = [
+                predicted(surface=Surface.from_parameters(SURFACE.parameters + s * deeper, 500.0), z=z_mm - s * 1e-2)
+                for s in (0.5, -0.5)
+            ]
+            numeric = (both[0] - both[1]) / 1e-2 * np.array([[0.5], [-0.5]])
         elif column < LOCAL:
-            steps = [np.eye(LOCAL)[column, PARAMETERS + 1 :] * size for size in (1e-5, -1e-5)]
+            steps = [np.eye(LOCAL)[column, BEYOND] * size for size in (1e-5, -1e-5)]
             both = [predicted(surface=replace(SURFACE, beyond_mm=tuple(step.tolist()))) for step in steps]
             numeric = (both[0] - both[1]) / 2e-5
         else:

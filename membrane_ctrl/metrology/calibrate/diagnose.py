@@ -98,7 +98,7 @@ class LeftOut:
 def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would remove more than noise from the residuals, the strongest first."""
     sums = np.sum(_reduced(solution), axis=0)
-    response = propagate.surface_response(solution, len(solution.states) // 2)[:, :-1]
+    response = propagate.surface_response(solution, solution.problem.middle)[:, :-1]
     flat = propagate.without_plane(*propagate.disc(1.0))
     out = []
     for name in parameters.NAMES[len(parameters.POSE) : parameters.OPTICAL]:
@@ -207,9 +207,11 @@ def _reduced(solution: solve.Solution) -> list[FloatArray]:
 def film_rise(solution: solve.Solution, film: separable.FilmModel) -> float:
     """By how much the sum of squares of a solution with a free film rises if the film is like that."""
     bound = []
-    for each, state in zip(solution.equations, solution.states, strict=True):
+    films = solution.problem.films
+    for k, (each, state) in enumerate(zip(solution.equations, solution.states, strict=True)):
         rows = separable.film_rows(state.surface, film)
-        bound.append(replace(each, sums=each.sums + rows.T @ rows).reduced())
+        told = each.sums + rows.T @ rows if k in films else each.sums
+        bound.append(replace(each, sums=told).reduced())
     return _squares(np.sum(bound, axis=0), solution) - _squares(np.sum(_reduced(solution), axis=0), solution)
 
 

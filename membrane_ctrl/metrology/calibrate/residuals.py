@@ -13,7 +13,7 @@ with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y t
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.polynomial import polynomial as series
 from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
 from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -66,8 +66,11 @@ def multiply(table, rows):  # type: ignore[no-untyped-def]
     return out
 
 
-# of one set: its surface's 36, the height of its vertex, and its round terms beyond the 36
-LOCAL = PARAMETERS + 1 + len(film_law.BEYOND)
+# of one set: its surface's 36, the height of its vertex, its round terms beyond the 36, and by how much the film was
+# deeper in the x frames than in the y frames
+BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(film_law.BEYOND))
+MOTION = BEYOND.stop
+LOCAL = MOTION + 1
 COLUMNS = LOCAL + OPTICAL
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
@@ -82,6 +85,10 @@ class SetPhases:
     screen_mm: FloatArray  # (2, n): s_x, s_y seen there
     sigma_mm: FloatArray  # (n,): expected noise of each of the two
     displacement_um: float  # mean laser reading of the set; NaN without
+    # how far the film may have moved from the x frames to the y frames; 0: not at all
+    motion_sigma_um: float = 0.0
+    moved_um: float = 0.0  # RMS motion of the film during the set, for which it is corrected
+    artefact: Artefact | None = None  # what stands in the mirror's place; None: the film
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
@@ -89,8 +96,13 @@ class SetPhases:
 
     def subset(self, keep: slice | BoolArray) -> "SetPhases":
         """Some of the bins."""
-        places = self.column_px[keep], self.row_px[keep]
-        return SetPhases(self.name, *places, self.screen_mm[:, keep], self.sigma_mm[keep], self.displacement_um)
+        return replace(
+            self,
+            column_px=self.column_px[keep],
+            row_px=self.row_px[keep],
+            screen_mm=self.screen_mm[:, keep],
+            sigma_mm=self.sigma_mm[keep],
+        )
 
 
 @dataclass(frozen=True)
@@ -99,7 +111,7 @@ class Chunk:
 
     place: slice  # which points
     residual_mm: FloatArray  # (2, m): seen minus predicted
-    # (2, COLUMNS, m), of the prediction by: 36 surface terms and the vertex's height, mm; the optical parameters
+    # (2, COLUMNS, m), of the prediction by: the set's own unknowns, mm; the optical parameters
     derivatives: FloatArray
 
 
@@ -125,15 +137,22 @@ def residual_mm(bench: BenchGeometry, phases: SetPhases, surface: Surface, verte
 
 
 def chunks(
-    bench: BenchGeometry, turns: list[Poses], phases: SetPhases, surface: Surface, vertex_z_mm: float
+    bench: BenchGeometry,
+    turns: list[Poses],
+    phases: SetPhases,
+    surface: Surface,
+    vertex_z_mm: float,
+    motion_mm: float = 0.0,
 ) -> Iterator[Chunk]:
     """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
     for part in _parts(points.t_mm.size):
         meet = _meet(bench, points, surface, part)
         lens = lens_derivatives(bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray)
-        seen = phases.screen_mm[:, part] - meet.screen_mm / bench.pitch
-        yield Chunk(part, seen, _derivatives(bench, turns, surface, meet, lens))
+        derivatives = _derivatives(bench, turns, surface, meet, lens)
+        # it is small enough to be linear
+        predicted = meet.screen_mm / bench.pitch + motion_mm * derivatives[:, MOTION]
+        yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
 
 
 def _parts(count: int) -> Iterator[slice]:
@@ -200,8 +219,10 @@ def _derivatives(
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
         by_terms = by_height[axis] * height - slope
-        out[axis, :PARAMETERS], out[axis, PARAMETERS + 1 : LOCAL] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
+        out[axis, :PARAMETERS], out[axis, BEYOND] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
+    deeper = np.einsum("j,ajm->am", _deeper(), out[:, :PARAMETERS]) - by_height
+    out[0, MOTION], out[1, MOTION] = deeper[0] / 2, -deeper[1] / 2
     in_camera = geometry.rotation @ d
     for j, turn in enumerate(turns):
         moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
@@ -216,6 +237,12 @@ def _derivatives(
     out /= bench.pitch
     out[:, -1] = -m.screen_mm / bench.pitch**2
     return out
+
+
+@cache
+def _deeper() -> FloatArray:
+    """Change (36,) of the surface's parameters by 1 mm of sag; the vertex goes down by as much."""
+    return Surface.hencky_bowl(1.0, 1.0).parameters
 
 
 def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray) -> FloatArray:

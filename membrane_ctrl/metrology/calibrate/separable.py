@@ -19,7 +19,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics import film_law
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, Surface
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -30,6 +30,8 @@ COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 # the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
+_STILL_UM = 1e-3  # of a film that does not move
+_TILT_STEP = 1e-4
 _PATCHES = 12  # across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
 _FEW_IN_PATCH = 4
 _CHANCE = 0.5  # by which patches' variance exceeds single points' without a cause
@@ -38,10 +40,11 @@ _HUBER = 1.9  # of the length of two normal components: keeps 95 % of the effici
 
 @dataclass(frozen=True)
 class SetState:
-    """Values of a set's own unknowns: its surface, and the height of its vertex in mm."""
+    """Values of a set's own unknowns."""
 
     surface: Surface
-    vertex_z_mm: float
+    vertex_z_mm: float  # height of its vertex
+    motion_mm: float = 0.0  # by how much the film was deeper in the x frames than in the y frames
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,19 @@ def less_trust(
     out as noise does. So the means over patches of the picture are compared with what single points let expect,
     set by set and as sums over the sets; where they scatter more, all points weigh less.
     """
-    side_px = max(max(np.ptp(p.column_px), np.ptp(p.row_px)) for p in sets) / _PATCHES
-    patches = [_patch_means(*each, side_px) for each in zip(sets, left_mm, trust, strict=True)]
-    together = _scatter(np.sum(patches, axis=0) / np.sqrt(len(patches)))
-    factors = [max(1.0, _scatter(means) - _CHANCE, together - _CHANCE) for means in patches]
+    films = [k for k, phases in enumerate(sets) if phases.artefact is None]  # an artefact is seen smaller
+    side_px = max(_across_px(sets[k]) for k in films) / _PATCHES
+    sides_px = [side_px if phases.artefact is None else _across_px(phases) / _PATCHES for phases in sets]
+    patches = [_patch_means(*each) for each in zip(sets, left_mm, trust, sides_px, strict=True)]
+    together = _scatter(np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films)))
+    alike = [together if phases.artefact is None else 0.0 for phases in sets]
+    factors = [max(1.0, _scatter(m) - _CHANCE, all_ - _CHANCE) for m, all_ in zip(patches, alike, strict=True)]
     return tuple(replace(t, variance=t.variance * f, alike=f) for t, f in zip(trust, factors, strict=True))
+
+
+def _across_px(phases: residuals.SetPhases) -> float:
+    """Longer side of the picture of what the camera sees."""
+    return float(max(np.ptp(phases.column_px), np.ptp(phases.row_px)))
 
 
 def _patch_means(phases: residuals.SetPhases, left_mm: FloatArray, trust: Trust, side_px: float) -> FloatArray:
@@ -156,7 +167,7 @@ def equations(
     keep = np.append(np.arange(residuals.COLUMNS), residuals.LOCAL + COMMON)
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
     residual = np.empty_like(phases.screen_mm)
-    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm):
+    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm):
         residual[:, part.place] = part.residual_mm
         for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
             sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])
@@ -169,12 +180,19 @@ def equations(
 def _reference_rows(
     phases: residuals.SetPhases, state: SetState, common: FloatArray, references: References
 ) -> FloatArray:
-    """Ring and laser as weighted rows [derivatives, miss]."""
-    rows = np.zeros((RING + 1, residuals.LOCAL + COMMON + 1))
+    """What is known of the set besides its fringes, as weighted rows [derivatives, miss].
+
+    Of a film: ring, laser, motion and law. Of an artefact: its form.
+    """
+    if phases.artefact is not None:
+        return _artefact_rows(phases.artefact, state)
+    rows = np.zeros((RING + 2, residuals.LOCAL + COMMON + 1))
+    rows[-1, residuals.MOTION], rows[-1, -1] = 1.0, -state.motion_mm
+    rows[-1] /= max(phases.motion_sigma_um, _STILL_UM) * 1e-3
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
-    ring[0, PARAMETERS + 1 : residuals.LOCAL] = _rim_beyond()
+    ring[0, residuals.BEYOND] = _rim_beyond()
     ring[:, residuals.LOCAL + len(parameters.NAMES) : -1] = -np.eye(RING)
     ring[:, -1] = common[len(parameters.NAMES) :] - rim_of(state)
     ring /= references.ring_sigma_um * 1e-3
@@ -191,7 +209,7 @@ def _reference_rows(
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
     """What the film says of the terms beyond the 36, as weighted rows [derivatives, miss]."""
     rows = np.zeros((len(film_law.BEYOND), residuals.LOCAL + COMMON + 1))
-    rows[:, PARAMETERS + 1 : residuals.LOCAL] = np.eye(len(film_law.BEYOND))
+    rows[:, residuals.BEYOND] = np.eye(len(film_law.BEYOND))
     rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * len(film_law.BEYOND))
     if film == "prestressed":
         excess_mm, step_mm = surface.parameters[-1], 1e-5
@@ -199,6 +217,26 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
         rows[:, PARAMETERS - 1] = (here - there) / step_mm
         rows[:, -1] += here
     return rows / (_FREE_MM if film == "free" else _LAW_MM)
+
+
+def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
+    """Form and place of an artefact as weighted rows; its tilt, the first two terms, is not known."""
+    terms = [*range(PARAMETERS), *range(residuals.BEYOND.start, residuals.BEYOND.stop)]
+    rows = np.zeros((len(terms), residuals.LOCAL + COMMON + 1))
+    form, (vertex, still) = rows[2:], rows[:2]
+    surface, origin = state.surface, np.zeros(1)
+    form[:, terms] = np.eye(len(terms))[2:]
+    # the tilt at the vertex is the surface's own, and its form follows: 5 um of coma for a milliradian
+    leans = np.stack([part[:, 0] for part in residuals.basis(origin, origin)[1:]]) / surface.radius_mm
+    tilt = leans @ surface.parameters
+    here = artefact.terms_mm(*tilt)
+    form[:, -1] = (here - np.append(surface.parameters, surface.beyond_mm or [0.0] * len(film_law.BEYOND)))[2:]
+    for step, lean in zip(_TILT_STEP * np.eye(2), leans, strict=True):
+        form[:, :PARAMETERS] -= np.outer((artefact.terms_mm(*(tilt + step)) - here)[2:] / _TILT_STEP, lean)
+    form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
+    vertex[[PARAMETERS, -1]] = np.array([1.0, artefact.vertex_mm - state.vertex_z_mm]) / artefact.vertex_sigma_mm
+    still[residuals.MOTION] = 1.0 / (1e-3 * _STILL_UM)
+    return rows
 
 
 def rim_of(state: SetState) -> FloatArray:
@@ -246,8 +284,7 @@ def averaged(
         np.bincount(cell, weights * value) / total for value in (phases.column_px, phases.row_px, *left)
     )
     sigma_mm = 1 / np.sqrt(total)
-    bare = residuals.SetPhases(
-        phases.name, column_px, row_px, np.zeros((2, total.size)), sigma_mm, phases.displacement_um
-    )
+    dark = np.zeros((2, total.size))
+    bare = replace(phases, column_px=column_px, row_px=row_px, screen_mm=dark, sigma_mm=sigma_mm)
     model = -residuals.residual_mm(bench, bare, state.surface, state.vertex_z_mm)
     return replace(bare, screen_mm=model + np.stack(rest))

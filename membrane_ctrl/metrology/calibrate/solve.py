@@ -45,6 +45,16 @@ class Problem:
     radius_mm: float  # of the ring
     rim: Rim | None = None  # the light's edge, where it is seen
 
+    @property
+    def films(self) -> list[int]:
+        """Which sets show the film; the others show artefacts."""
+        return [k for k, phases in enumerate(self.sets) if phases.artefact is None]
+
+    @property
+    def middle(self) -> int:
+        """The set of the film in the middle of their order: results are stated for a figure like its."""
+        return self.films[len(self.films) // 2]
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -114,11 +124,11 @@ def solve(
 ) -> Solution:
     """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
 
-    Raises ValueError if there is no set, or if a set's points do not determine a surface. `progress` gets the number
-    of the step and its largest change in standard deviations; `start` is a solution of the same sets.
+    Raises ValueError if there is no set of the film, or if a set's points do not determine a surface. `progress` gets
+    the number of the step and its largest change in standard deviations; `start` is a solution of the same sets.
     """
-    if not problem.sets:
-        raise ValueError("no capture set to calibrate with")
+    if not problem.films:
+        raise ValueError("no capture set of the film to calibrate with")
     with np.errstate(over="ignore", invalid="ignore"):  # the numbers show a divergence, below
         return _solve(problem, progress, start)
 
@@ -133,7 +143,7 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
     # the parameters as stated, and the ring as the first surfaces have it
-    ring = np.mean([separable.rim_of(state) for state in states], axis=0)
+    ring = np.mean([separable.rim_of(states[k]) for k in problem.films], axis=0)
     common = start.common if start is not None else np.append(np.zeros(len(parameters.NAMES)), ring)
     trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
@@ -187,9 +197,10 @@ def _linearise(
 def _moved(state: separable.SetState, linear: separable.Equations, common_step: FloatArray) -> separable.SetState:
     own = linear.local_step(common_step)
     surface = Surface.from_parameters(state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm)
-    beyond_mm = np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[PARAMETERS + 1 :]
+    beyond_mm = np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[residuals.BEYOND]
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
-    return separable.SetState(surface, state.vertex_z_mm + float(own[PARAMETERS]))
+    vertex_z_mm, motion_mm = state.vertex_z_mm + own[PARAMETERS], state.motion_mm + own[residuals.MOTION]
+    return separable.SetState(surface, float(vertex_z_mm), float(motion_mm))
 
 
 def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
@@ -198,9 +209,12 @@ def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
 
 
 def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
-    moved_um = phases.displacement_um - problem.references.reference_um
+    moved_um, artefact = phases.displacement_um - problem.references.reference_um, phases.artefact
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
-    fit = fit_on(parameters.BenchGeometry(problem.stated), phases, problem.radius_mm, vertex_z_mm)
+    radius_mm = problem.radius_mm
+    if artefact is not None:
+        vertex_z_mm, radius_mm = artefact.vertex_mm, artefact.radius_mm
+    fit = fit_on(parameters.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
     return separable.SetState(fit.surface, vertex_z_mm)
 
 

@@ -19,6 +19,8 @@ _FEW_POINTS = 500  # of a set: ten times its unknowns
 _SCATTER = 3.0  # times the others' noise
 # with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 um
 _HARMLESS_UM = 2.5
+# a correction leaves a tenth of the motion, as ripples of half a fringe: more than the noise
+_STEADY_UM = 4.0
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,15 @@ class CalibrationFinding:
 
 def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     """Findings without solving: sets too close together, a laser with another scale or sign."""
-    moved = np.array([phases.displacement_um for phases in problem.sets])
+    states = first_states(problem)
+    moved = np.array([problem.sets[k].displacement_um for k in problem.films])
     known = np.isfinite(moved)
-    sag_um = np.array([1e3 * state.surface.sag_mm for state in first_states(problem)])
+    sag_um = np.array([1e3 * states[k].surface.sag_mm for k in problem.films])
     spread_um = float(np.ptp(moved[known])) if known.any() else 0.0
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
+        if len(problem.films) < len(problem.sets):
+            return ()  # the artefacts add what the film does not
         says = (
             f"the sets are only {max(spread_um, seen_um):.0f} um apart: they add nothing to one of them; "
             f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
@@ -64,8 +69,18 @@ def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     if not solution.converged:
         return (film[0][1] if film else _astray(solution),)
     causes = [*film, *_sets(solution), *_laser(solution), *_model(solution)]
-    cause = [max(causes, key=lambda each: each[0])[1]] if causes else []
+    cause = [_moving(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
     return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
+
+
+def _moving(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
+    """The finding, with the motion of a film that moved so much that its correction may be the cause."""
+    sets = solution.problem.sets
+    most = max(finding.sets or range(len(sets)), key=lambda k: sets[k].moved_um)
+    if sets[most].moved_um < _STEADY_UM:
+        return finding
+    says = f"or: the film moved by {sets[most].moved_um:.0f} um RMS while {sets[most].name} was taken: hold it still"
+    return replace(finding, says=f"{finding.says}; {says}")
 
 
 def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -157,6 +172,8 @@ def _agree(problem: Problem) -> bool:
 def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
     rest, phases = diagnose.without(solution, index), solution.problem.sets[index]
+    if phases.artefact is not None:
+        return f"it is not the {phases.artefact.name} that its file states, or it stood elsewhere"
     rim_mm = separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (rest.common[len(parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
@@ -200,7 +217,10 @@ def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
 
 def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What other sets would have determined."""
-    moved = np.array([phases.displacement_um for phases in solution.problem.sets])
+    problem = solution.problem
+    moved = np.array([problem.sets[k].displacement_um for k in problem.films])
+    if len(problem.films) < len(problem.sets):
+        return ()  # the sag rests on the artefacts
     if np.count_nonzero(np.isfinite(moved)) < 2:
         says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
         return (CalibrationFinding(False, says),)

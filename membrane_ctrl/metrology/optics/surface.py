@@ -110,6 +110,57 @@ def height_probe() -> FloatArray:
     return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
 
 
+@cache
+def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x and y (n,) over the unit disc, and least squares (39, n) from heights there to parameters and `BEYOND`."""
+    k = np.arange(1024)
+    rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
+    x, y = rho * np.cos(theta), rho * np.sin(theta)
+    excess = np.polynomial.polynomial.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
+    own = zernike.values(x, y).T @ parameter_to_coeffs() + np.outer(excess, np.eye(PARAMETERS)[-1])
+    beyond = np.polynomial.polynomial.polyval(rho**2, film_law.beyond().T).T
+    return x, y, np.linalg.pinv(np.hstack([own, beyond]))
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A surface of known form that stands in the mirror's place: a flat, or a concave sphere."""
+
+    curvature_per_mm: float  # 0: flat
+    curvature_sigma_per_mm: float
+    form_sigma_mm: float  # of each of its terms
+    vertex_mm: float  # height of its vertex in world
+    vertex_sigma_mm: float
+    radius_mm: float  # of its disc
+
+    @property
+    def name(self) -> str:
+        """For a person."""
+        return "sphere" if self.curvature_per_mm else "flat"
+
+    def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
+        """Parameters (36,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
+        x, y, onto = _from_heights()
+        return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))
+
+    def covariance_mm2(self) -> FloatArray:
+        """Covariance of `terms_mm` by curvature and form."""
+        x, y, onto = _from_heights()
+        step = 1e-9  # per mm: the sag is linear in so little
+        change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(self.curvature_per_mm, x, y)
+        by_curvature = onto @ change / step * self.curvature_sigma_per_mm
+        return np.asarray(np.outer(by_curvature, by_curvature) + self.form_sigma_mm**2 * np.eye(len(onto)))
+
+    def _heights_mm(
+        self, curvature: float, x: FloatArray, y: FloatArray, tilt_x: float = 0.0, tilt_y: float = 0.0
+    ) -> FloatArray:
+        """The sphere c |P|^2 = 2 n P through the origin with the normal n, at points (n,) of the unit disc."""
+        x, y = x * self.radius_mm, y * self.radius_mm
+        across = 1 / math.sqrt(1 + tilt_x**2 + tilt_y**2)
+        q = curvature * (x * x + y * y) + 2 * across * (tilt_x * x + tilt_y * y)
+        return np.asarray(q / (across + np.sqrt(across**2 - curvature * q)))
+
+
 # The radial profile against Hencky's bowl, and the pressure that belongs to it.
 
 

@@ -8,7 +8,7 @@ moves with the rim.
 from dataclasses import dataclass, field
 from functools import cache
 from math import comb, cos, exp, factorial, isfinite, pi, radians, sin, sqrt
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
@@ -17,6 +17,8 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 
 MAX_ZERNIKE = 36  # all terms of radial order 7 or less
+_SPHERE_TERMS = 40  # those left out are below 1e-12 for radii up to half of the curvature's
+_Form = Literal["hencky", "paraboloid", "sphere"]
 
 
 class FilmTerms(NamedTuple):
@@ -96,14 +98,18 @@ def heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray)
     return h_mm
 
 
-def hencky_series() -> FloatArray:
-    """Height of a Hencky bowl of unit sag above its vertex: element k multiplies rho^(2k); nu = 0.3."""
-    return gas_film.solve().profile
+def bowl_series(bowl: _Form, sag_mm: float, radius_mm: float) -> FloatArray:
+    """Height of a bowl of unit sag above its vertex: element k multiplies rho^(2k).
 
-
-def paraboloid_series() -> FloatArray:
-    """Height of a paraboloid of unit sag: rho^2."""
-    return np.array([0.0, 1.0])
+    Hencky's has nu = 0.3; a concave sphere's depends on its sag: 1 - sqrt(1 - x rho^2), x = (radius / curvature's)^2.
+    """
+    if bowl == "hencky":
+        return gas_film.solve().profile
+    if bowl == "paraboloid":
+        return np.array([0.0, 1.0])
+    x = (2 * sag_mm * radius_mm / (radius_mm**2 + sag_mm**2)) ** 2
+    terms = np.array([0.0] + [comb(2 * k, k) / (4**k * (2 * k - 1)) * x**k for k in range(1, _SPHERE_TERMS)])
+    return np.asarray(terms / terms.sum())
 
 
 # Zernike terms in Noll's order as polynomials in x and y, orthonormal (unit RMS) over the unit disc.
@@ -154,8 +160,7 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
 def polynomial(coeffs: FloatArray) -> FloatArray:
     """Sum of Zernike terms, coefficients (J,) of Noll's j = 1..J, as a polynomial of the unit disc's x and y.
 
-    Element (i, k) of the (D + 1, D + 1) array multiplies x^i y^k, in the same unit; D is the highest degree that is
-    used.
+    Element (i, k) of the (D + 1, D + 1) array multiplies x^i y^k, in the same unit; D is the highest degree used.
     """
     used = [j for j, value in enumerate(coeffs, start=1) if value != 0.0]
     degree = max((noll_orders(j)[0] for j in used), default=0)
@@ -213,7 +218,7 @@ class FilmShape:
 
     sag_mm: float  # depth of the bowl (rim above vertex, without the other terms) at displacement 0
     radius_mm: float = 500.0
-    bowl: Literal["hencky", "paraboloid"] = "hencky"
+    bowl: _Form = "hencky"
     # Noll j = 1.., orthonormal over `radius_mm`, added to the bowl (piston is without effect)
     zernike_um: tuple[float, ...] = ()
     ripples: tuple[Ripple, ...] = ()
@@ -229,8 +234,10 @@ class FilmShape:
             raise ValueError(f"sag_mm = {self.sag_mm} must be a number")
         if not self.radius_mm > 0:
             raise ValueError(f"radius_mm = {self.radius_mm} must be above 0")
-        if self.bowl not in ("hencky", "paraboloid"):
-            raise ValueError(f"bowl = {self.bowl!r} must be hencky or paraboloid")
+        if self.bowl not in get_args(_Form):
+            raise ValueError(f"bowl = {self.bowl!r} must be one of {', '.join(get_args(_Form))}")
+        if self.bowl == "sphere" and not 0 < self.sag_mm < self.radius_mm:
+            raise ValueError(f"sag_mm = {self.sag_mm:g}: a concave sphere's is above 0 and below its radius")
         if not all(isfinite(c) for c in self.zernike_um):
             raise ValueError("zernike_um: every value must be a number")
         if len(self.zernike_um) > MAX_ZERNIKE:
@@ -245,7 +252,7 @@ class FilmShape:
 
     def terms_at(self, displacement_um: float) -> FilmTerms:
         """The film as numbers at a displacement, where a stretched film has a profile of its own."""
-        if self.bowl == "paraboloid" or (self.prestrain, self.poisson) == (0.0, gas_film.POISSON_PET):
+        if self.bowl != "hencky" or (self.prestrain, self.poisson) == (0.0, gas_film.POISSON_PET):
             return self.terms
         return self.terms._replace(bowl=self.load_and_bowl(displacement_um)[1])
 
@@ -265,7 +272,7 @@ class FilmShape:
 
         A paraboloid s rho^2 is s/(2 sqrt 3) of Z4 = sqrt(3) (2 rho^2 - 1) above a piston of s/2.
         """
-        if self.bowl == "hencky" or self.ripples or self.wrinkles or self.bumps:
+        if self.bowl != "paraboloid" or self.ripples or self.wrinkles or self.bumps:
             return None
         coeffs = np.zeros(MAX_ZERNIKE)
         coeffs[: len(self.zernike_um)] = self.zernike_um
@@ -277,21 +284,14 @@ class FilmShape:
 
 def _terms(film: FilmShape) -> FilmTerms:
     """The film as numbers for the kernel, its offset chosen so that h(0, 0) = 0."""
-    ripples = [
-        (
-            r.amplitude_um / 1000.0,
-            2.0 * pi / r.wavelength_mm * cos(radians(r.direction_deg)),
-            2.0 * pi / r.wavelength_mm * sin(radians(r.direction_deg)),
-            r.phase_rad,
-        )
-        for r in film.ripples
-    ]
+    waves = [(r, 2.0 * pi / r.wavelength_mm, radians(r.direction_deg)) for r in film.ripples]
+    ripples = [(r.amplitude_um / 1000.0, k * cos(turn), k * sin(turn), r.phase_rad) for r, k, turn in waves]
     wrinkles = [(w.amplitude_um / 1000.0, float(w.lobes), w.phase_rad) for w in film.wrinkles]
     bumps = [(b.amplitude_um / 1000.0, b.x_mm, b.y_mm, b.sigma_mm) for b in film.bumps]
     raised = FilmTerms(
         radius_mm=film.radius_mm,
         offset_mm=0.0,
-        bowl=hencky_series() if film.bowl == "hencky" else paraboloid_series(),
+        bowl=bowl_series(film.bowl, film.sag_mm, film.radius_mm),
         poly_mm=polynomial(np.array(film.zernike_um, dtype=np.float64) / 1000.0),
         ripples=np.array(ripples, dtype=np.float64).reshape(-1, 4),
         wrinkles=np.array(wrinkles, dtype=np.float64).reshape(-1, 3),

@@ -38,6 +38,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "geometry": geometry,
         "camera": camera,
         "mirror": _written(spec.optics.mirror),
+        **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
         "frames": [_frame_row(spec, frame, float(readings_um[frame])) for frame in range(len(spec.patterns))],
     }
     return table

@@ -1,11 +1,15 @@
 """The specification of a simulated capture set, checked before anything is written."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import isfinite, pi, sin
+from math import isfinite, isinf, pi, sin, sqrt
 from typing import Literal, get_args
+
+import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 from membrane_ctrl.sim.optics import film_shape, shade, trace
 
@@ -76,6 +80,33 @@ class Motion:
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
+def leaning(
+    curvature_mm: float, radius_mm: float, lean_x: float, lean_y: float, form_um: FloatArray | None = None
+) -> film_shape.FilmShape:
+    """A concave sphere, or a flat (infinite radius of curvature), in the mirror's place.
+
+    Its slopes at the vertex are `lean_x`, `lean_y`: a sphere that leans by 1 mrad has micrometres of coma. `form_um`
+    (36,) are Noll terms of its form error.
+    """
+    coeffs_um = np.zeros(film_shape.MAX_ZERNIKE) if form_um is None else np.array(form_um)
+    coeffs_um[1:3] += 1e3 * radius_mm / 2 * np.array([lean_x, lean_y])
+    if isinf(curvature_mm):
+        return film_shape.FilmShape(0.0, radius_mm, "paraboloid", tuple(coeffs_um.tolist()))
+    rho, theta = np.meshgrid(np.sqrt((np.arange(40) + 0.5) / 40), 2 * pi * np.arange(40) / 40)
+    x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
+    terms = [film_shape.polynomial(row) for row in np.eye(film_shape.MAX_ZERNIKE)]
+    design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
+    # the centre is at R (-lean_x, -lean_y, 1) / length
+    centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / sqrt(1 + lean_x**2 + lean_y**2)
+    across = (radius_mm * x - centre[0]) ** 2 + (radius_mm * y - centre[1]) ** 2
+    height = centre[2] - np.sqrt(curvature_mm**2 - across)
+    upright = curvature_mm - np.sqrt(curvature_mm**2 - radius_mm**2 * (x * x + y * y))
+    ramp = radius_mm * (lean_x * x + lean_y * y)
+    coeffs_um += 1e3 * np.linalg.lstsq(design, height - upright - ramp, rcond=None)[0]
+    sag_mm = curvature_mm - sqrt(curvature_mm**2 - radius_mm**2)
+    return film_shape.FilmShape(sag_mm, radius_mm, "sphere", tuple(coeffs_um.tolist()))
+
+
 @dataclass(frozen=True, slots=True)
 class SimulationSpec:
     """One simulated capture set. Raises ValueError naming the field and a valid value."""
@@ -100,6 +131,7 @@ class SimulationSpec:
     screen_error: trace.ScreenError | None = None
     exact: bool = False
     seed: int = 1
+    artefact: Mapping[str, str | float] = field(default_factory=dict)  # `[artefact]` of a set that shows one
     faults: tuple[FrameFault, ...] = ()  # faults of single frames
     # modulus times thickness, for the gauge's reading
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
