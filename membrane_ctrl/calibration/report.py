@@ -117,7 +117,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     if (sphere := report["artefact_advice"]) is not None:
         together = " and ".join(sphere["together"][:2])
         lines.append(
-            (f"{together} cannot be told apart here: put" if together else "better: put")
+            (f"not told apart here: {together}; put" if together else "better: put")
             + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
             f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} um"
