@@ -187,14 +187,16 @@ class CrossedWorld:
         table["frames"] = rows
         (folder / "capture.toml").write_text(tomli_w.dumps(table))
 
-    def write_track(self, folder: Path, times: Array, dust_every: int = 50) -> None:
-        """Write a tracking set beside `full`: five steps, then a pattern that stands still."""
+    def write_track(self, folder: Path, times: Array, step_every_s: float = 10.0, dust_every: int = 25) -> None:
+        """Write a tracking set beside `full`: five steps, then a pattern that stands still from step to step."""
         folder.mkdir(parents=True)
-        rows = []
+        rows, step, stepped_s = [], -1, -math.inf
         for k, t in enumerate(times):
             if self.dust and k % dust_every == dust_every - 1:
                 self.move_dust()
-            shift_x, shift_y = (2 * math.pi * k / 5, 4 * math.pi * k / 5) if k < 5 else (0.0, 0.0)
+            if k < 5 or t - stepped_s >= step_every_s:
+                step, stepped_s = step + 1, float(t)
+            shift_x, shift_y = 2 * math.pi * (step % 5) / 5, 2 * math.pi * (2 * step % 5) / 5
             cv2.imwrite(str(folder / f"t{k}.png"), self.crossed(float(t), shift_x, shift_y))
             rows.append({
                 "file": f"t{k}.png", "role": "crossed", "shift_x_rad": shift_x, "shift_y_rad": shift_y,

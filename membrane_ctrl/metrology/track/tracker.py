@@ -108,13 +108,28 @@ class Tracker:
             seen.append(self._seen)
         if any(frame.verdict == "rejected" for frame in found):
             return found
-        moved = self._renew(fits, np.stack(seen), shifts_rad)
+        shown = [(float(x), float(y)) for x, y in shifts_rad]
+        errors_mm2 = np.diag(self._fitter.covariance_mm2(self._last, shown[-1], self._noise_adu))
+        moved = self._renew(fits, [errors_mm2] * len(fits), np.stack(seen), shown)
         return [tracked.moved_frame(frame, moved, self._last.surface.radius_mm) for frame in found]
 
-    def _renew(self, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray) -> FloatArray:
-        """Light, swings and phases of each bin from steps; returns by how much the parameters (36,) move."""
-        old = self._fitter.scene
-        scene, moved = stepped(self._fitter, fits, seen_adu, shifts_rad)
+    def _renew(
+        self,
+        fits: list[FrameFit],
+        variance_mm2: list[FloatArray],
+        seen_adu: Singles,
+        shifts_rad: list[tuple[float, float]],
+    ) -> FloatArray:
+        """Light, swings and phases of each bin from steps; returns by how much the parameters (36,) move.
+
+        `variance_mm2` are those of the fits' parameters, each (36,).
+        """
+        old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
+        seen_at, place_mm2 = steadied(np.array([fit.surface.parameters for fit in fits]), np.array(variance_mm2))
+        places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
+        self._places_mm2 = dict(zip(shifts_rad, place_mm2, strict=True))
+        fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
+        scene, moved = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
         self._anchor_light /= float(np.median(scene.light_adu[0] / old.light_adu[0]))  # light counts from the scene's
         parameters = self._last.surface.parameters + moved
         self._begin(scene, surface.Surface.from_parameters(parameters, scene.surface.radius_mm))
@@ -135,19 +150,10 @@ class Tracker:
         last, noise_adu = steps[-1].fit(radius_mm), self._noise_adu / math.sqrt(steps[-1].count)
         errors_mm2 = np.diag(self._fitter.covariance_mm2(last, steps[-1].shifts_rad, noise_adu))
         steps[-1].variance_mm2 = errors_mm2 + self._place_mm2(steps[-1].shifts_rad)
-        shown = np.array([step.shifts_rad for step in steps])
-        if not separable(shown):
-            return
-        fits = [step.fit(radius_mm) for step in steps]
-        places, place_mm2 = steadied(
-            np.array([fit.surface.parameters for fit in fits]), np.array([step.variance_mm2 for step in steps])
-        )
-        fits = [
-            replace(fit, surface=surface.Surface.from_parameters(place, radius_mm))
-            for fit, place in zip(fits, places, strict=True)
-        ]
-        self._places_mm2 = dict(zip((step.shifts_rad for step in steps), place_mm2, strict=True))
-        self._renew(fits, np.stack([step.seen_adu() for step in steps]), shown)
+        shown = [step.shifts_rad for step in steps]
+        if separable(np.array(shown)):
+            fits, variance_mm2 = [step.fit(radius_mm) for step in steps], [step.variance_mm2 for step in steps]
+            self._renew(fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown)
 
     def _place_mm2(self, shifts_rad: tuple[float, float]) -> FloatArray:
         """Variance (36,) of the place at which the steps saw the mirror with these shifts, common to their frames."""

@@ -1,0 +1,160 @@
+"""Tracked figures of a world that shares no code with the product: errors are as large as their bars say."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.cli import run
+from membrane_ctrl.metrology.optics import zernike
+from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld
+
+CLEAN = {
+    "drift_um_per_s": 0.0, "swing_um": 0.0, "shimmer_um": 0.0, "brightness": 0.0, "ambient_adu": 0.0, "bend": 0.0,
+    "dim_per_s": 0.0, "dust": 0, "air_um": 0.0,
+}  # fmt: skip
+MOVING = {"swing_um": 0.3, "shimmer_um": 0.1, "drift_um_per_s": 0.002}
+EFFECTS: dict[str, dict[str, float]] = {
+    "still": {},
+    "hardly any noise": {"noise_adu": 0.05},  # what repeats from frame to frame shows
+    "noise": {"noise_adu": 1.8},
+    "moving": MOVING,
+    "light that wanders": {"brightness": 0.005},
+    "ambient light": {"ambient_adu": 2.0},
+    "bent response": {"bend": 0.04},
+    "dimming": {"dim_per_s": 1e-4},
+    "dust": {"dust": 20},
+    "seeing": {"air_um": 0.1},
+    "all": {**MOVING, "brightness": 0.005, "ambient_adu": 2.0, "bend": 0.04, "dust": 20, "air_um": 0.1},
+}
+FRAME_S = 0.43
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of frames (m,) against the figure that `measure` gives of the reference, in their own sigmas."""
+
+    sag: Array
+    terms: Array  # (m, 35): Noll 2 to 36
+    verdicts: set[str]
+
+
+def errors_of(folder: Path, effect: str, seed: int, frames: int, step_every_s: float) -> Errors:
+    """Make a reference and a tracking set, run both commands, compare."""
+    world = CrossedWorld(width=245, height=205, pixel_um=34.5, seed=seed, **CLEAN | EFFECTS[effect])  # type: ignore[arg-type]
+    world.write_reference(folder / "full")
+    world.write_track(folder / "track", 0.5 + FRAME_S * np.arange(frames), step_every_s)
+    assert run(["measure", str(folder / "full"), "--no-pictures"]) == 0
+    assert run(["track", str(folder / "track"), "--no-pictures"]) == 0
+    result, details = (
+        json.loads((folder / f"full/result/{name}.json").read_text()) for name in ("result", "details")
+    )
+    found = np.load(folder / "track/result/track.npz")
+    sag_um = np.array([world.sag_um(t) - world.sag_um(0.0) for t in found["time_s"]])
+    sag = (found["sag_um"] - 1e3 * details["sag_mm"] - sag_um) / found["sag_sigma_um"]
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.95, 0.95, 41)] * 2))
+    inside = np.hypot(x, y) <= 0.95
+    x, y = x[inside], y[inside]
+    columns = zernike.values(x, y).T
+    before_um = world.height_um(0.0, RADIUS_MM * x, RADIUS_MM * y)
+    moved_um = np.array([world.height_um(t, RADIUS_MM * x, RADIUS_MM * y) - before_um for t in found["time_s"]])
+    true_um = np.linalg.lstsq(columns, moved_um.T, rcond=None)[0].T
+    error_um = found["coeffs_um"] - np.array(result["zernike"]["coeffs_um"]) - true_um
+    return Errors(sag, (error_um / found["sigma_um"])[:, 1:], set(found["verdict"].tolist()))
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize("effect", ["hardly any noise", "all"])
+def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
+    found = errors_of(tmp_path, effect, seed=1, frames=30, step_every_s=2.0)
+    assert found.verdicts == {"ok"}
+    assert 0.6 < rms(found.terms) < 1.5
+    assert rms(found.sag) < 2.0
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_each_effect_alone(tmp_path: Path, effect: str, capsys: pytest.CaptureFixture[str]) -> None:
+    seeds = [errors_of(tmp_path / str(seed), effect, seed, frames=120, step_every_s=10.0) for seed in (1, 2, 3)]
+    sag, terms = np.concatenate([one.sag for one in seeds]), np.concatenate([one.terms for one in seeds])
+    worst = np.sqrt(np.mean(np.square(terms), axis=0)).max()
+    with capsys.disabled():
+        print(f"\n{effect}: sag {rms(sag):.2f}, terms {rms(terms):.2f}, worst {worst:.2f}, ", end="")
+        print(f"largest {np.abs(terms).max():.1f} sigma")
+    assert set.union(*[one.verdicts for one in seeds]) == {"ok"}
+    assert 0.7 < rms(terms) < 1.3
+    assert 0.5 < rms(sag) < 1.6
+
+
+@dataclass
+class BentWorld(CrossedWorld):
+    """The same with one more Noll term; the ring rests, so that the vertex moves."""
+
+    term: int = 2
+    amount_um: float = 0.0
+
+    def _more_mm(self, x: Array, y: Array) -> Array:
+        place = np.ravel(x) / RADIUS_MM, np.ravel(y) / RADIUS_MM
+        height = zernike.values(*place)[self.term - 1] - zernike.at_vertex()[self.term - 1]
+        return np.asarray(1e-3 * self.amount_um * height.reshape(np.shape(x)))
+
+    def film_mm(self, x: Array, y: Array, t: float) -> Array:
+        return np.asarray(super().film_mm(x, y, t) + self._more_mm(x, y))
+
+    def vertex_z_mm(self, t: float) -> float:
+        azimuth = np.linspace(0, 2 * math.pi, 180, endpoint=False)
+        rim_mm = self._more_mm(RADIUS_MM * np.cos(azimuth), RADIUS_MM * np.sin(azimuth))
+        return super().vertex_z_mm(t) - float(rim_mm.mean())
+
+
+def light_of(world: CrossedWorld) -> Array:
+    """What every pixel sees without noise, (5, height, width): level, x and y wave; its place x, y on the mirror.
+
+    NaN beyond the analysis radius or the pattern.
+    """
+    s_x, s_y, x, y, _ = world.trace(0.0)
+    used = (np.hypot(x, y) <= 475) & (np.maximum(np.abs(s_x), np.abs(s_y)) < SIDE_MM / 2)
+    bright = np.where(used, 190 * 0.98 / 4 * (1 - 0.1 * (x**2 + y**2) / RADIUS_MM**2), np.nan)
+    waves = [-np.cos(2 * math.pi * CROSSED / SIDE_MM * s) for s in (s_x, s_y)]
+    return np.stack([2 * bright, bright * waves[0], bright * waves[1], x, y])
+
+
+def cramer_rao_um(noise_adu: float) -> Array:
+    """Least 1 sigma (35,) of Noll terms 2 to 36 in um, with maps of level and both contrasts unknown as well."""
+    setup = CLEAN | {"width": 245, "height": 205, "pixel_um": 34.5}
+    seen = light_of(BentWorld(**setup))  # type: ignore[arg-type]
+    columns = []
+    for term in range(2, 37):
+        more, less = (light_of(BentWorld(**setup, term=term, amount_um=a)) for a in (1.0, -1.0))  # type: ignore[arg-type]
+        columns.append((more - less)[:3].sum(axis=0) / 2)
+    maps = zernike.values(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(36, *seen.shape[1:])
+    every = np.array([*columns, *(wave * one for wave in seen[:3] for one in maps)]).reshape(35 + 108, -1)
+    every = every[:, np.isfinite(every).all(axis=0)]
+    fisher = every @ every.T / (noise_adu**2 + 1 / 12)
+    scale = 1 / np.sqrt(np.diag(fisher))
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(fisher * np.outer(scale, scale)))) * scale)[:35]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("noise_adu", [0.4, 1.8])
+def test_noise_is_near_the_cramer_rao_bound(
+    tmp_path: Path, noise_adu: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    still = CLEAN | {"noise_adu": noise_adu, "width": 245, "height": 205, "pixel_um": 34.5}
+    world = CrossedWorld(seed=5, **still)  # type: ignore[arg-type]
+    world.write_reference(tmp_path / "full")
+    world.write_track(tmp_path / "track", FRAME_S * np.arange(1, 66), step_every_s=math.inf)
+    assert run(["track", str(tmp_path / "track"), "--no-pictures"]) == 0
+    coeffs_um = np.load(tmp_path / "track/result/track.npz")["coeffs_um"][5:, 1:]
+    ratio = coeffs_um.std(axis=0, ddof=1) / cramer_rao_um(noise_adu)
+    with capsys.disabled():
+        print(f"\nnoise {noise_adu}: {rms(ratio):.2f} of the bound, worst term {ratio.max():.2f}")
+    assert 0.85 < rms(ratio) < 1.3
