@@ -91,6 +91,8 @@ class _Figures:
         um = figure.sag_um - self._zero_um
         if figure.verdict == "rejected":
             self._refused = f": {figure.reason}"
+        elif figure.kind == "full":
+            self._refused = ": it has only been anchored"  # which shows another sag than the frames after it
         elif not math.isfinite(um):
             self._refused = ": it is not finite"
         elif not figure.time_s <= now_s or figure.time_s <= self._time_s:

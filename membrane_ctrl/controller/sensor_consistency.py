@@ -208,6 +208,7 @@ class Holders:
         self._by_optics = config.by_optics
         self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
         self._filter = CentreFilter(config.estimator, config.loop)
+        self._tracks = config.shape.mode == "track"
         self._running = self._locking = False
         # while laser and camera agree: what the filter then gave to the mount was the film's, if the camera was wrong
         self._agreed_mount = LowPass(film.REFERENCE_S)
@@ -260,6 +261,9 @@ class Holders:
         elif consistency.camera_lies and self._filter.frames and not self._by_optics:
             self._filter.blame_optics(self._agreed_mount.value)
         figure = inputs.estimate
+        if figure and figure.kind == "full" and self._tracks and figure.verdict != "rejected":
+            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
+            figure = None
         if off or consistency.camera_lies or (figure and figure.verdict == "rejected"):
             figure = None
         reading = inputs.reading

@@ -88,7 +88,8 @@ class VirtualRun:
         self._bench = bench
         self._rings = rings or {}
         self._shape, self._alter = shape, alter
-        self._shape_period_s = config.shape.period_s
+        track = config.shape.mode == "track"
+        self._shape_period_s = 1 / config.shape.track_rate_hz if track else config.shape.period_s
         self._shape_due_s = 0.0
         self._period_s = 1.0 / config.loop.rate_hz
         self._steps = 0

@@ -37,6 +37,7 @@ BY_OPTICS = Config(estimator=EstimatorConfig(process_value="optics"), shape=Shap
 BY_ALL = Config(
     estimator=EstimatorConfig(process_value="estimate"), twin=TwinConfig(start_error_um=-1.0, scenario="quiet")
 )
+BY_TRACKS = BY_ALL.model_copy(update={"shape": ShapeConfig(mode="track")})
 NOTHING: Callable[[Wrong, float], None] = lambda wrong, now_s: None  # noqa: E731
 
 
@@ -164,6 +165,10 @@ def test_a_start_waits_for_a_camera_that_prepares(
         ),
         (lambda figure, n: _with(figure, time_s=figure.time_s - 0.6), "no figure of the mirror for 0.5 s: its time"),
         (lambda figure, n: _with(figure, time_s=figure.time_s + 9), "no figure of the mirror for 0.5 s: its time"),
+        (
+            lambda figure, n: _with(figure, kind="full"),
+            "no figure of the mirror for 0.5 s: it has only been anchored",
+        ),
         (lambda figure, n: _with(figure, time_s=math.nan), "no figure of the mirror for 0.5 s: its time"),
         (
             lambda figure, n: _with(figure, verdict="rejected", reason="a hand"),
@@ -179,6 +184,7 @@ def test_a_start_waits_for_a_camera_that_prepares(
         "jump",
         "old",
         "of the future",
+        "anchor",
         "never",
         "rejected",
     ],
@@ -226,6 +232,28 @@ def test_a_camera_that_stood_still_does_not_take_its_zero_with_it() -> None:
     (fault,) = told(ticks, Fault)
     assert fault.seen == "the camera repeats one figure to the last bit"
     assert true_um(ticks, 32.0).mean() == pytest.approx(true_um(ticks, 17.0, 20.0).mean(), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "config", [BY_OPTICS, pytest.param(BY_TRACKS, marks=pytest.mark.campaign)], ids=["alone", "all"]
+)
+def test_another_anchor_of_the_tracking_does_not_move_the_mirror(config: Config) -> None:
+    """Two anchors of one film differ by up to a micrometre; here by three."""
+    bench = VirtualBench(Plant(config.twin, config.pump))
+    figures = TruthShape(bench, config, 3, 0.036)
+
+    def figure(now_s: float) -> Any:
+        made = figures(now_s)
+        if not 20.0 < now_s < 22.0:
+            return _with(made, sag_um=made.sag_um + 3.0 * (now_s >= 22.0), kind="track")
+        return _with(made, sag_um=made.sag_um + 8.0, kind="full") if now_s > 21.95 else None
+
+    run = VirtualRun(config, bench, zernike_projection(), figure)
+    run._shape_period_s = 0.06
+    ticks = [run.tick((Command("hold", "a test", "it runs"),))]
+    ticks += [run.tick() for _ in range(1399)]
+    assert all(ticks)
+    assert np.abs(true_um(ticks, 20.0) - true_um(ticks, 17.0, 20.0).mean()).max() < 0.3
 
 
 def test_the_optics_of_such_a_bench_cannot_be_switched_off() -> None:

@@ -11,7 +11,7 @@ from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
-from membrane_ctrl.review.events.found import find_events, noise_changes, weather_losses
+from membrane_ctrl.review.events.found import find_events, laser_losses, noise_changes, weather_losses
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level
 from tests.support.synthetic_shape import from_estimates
@@ -73,6 +73,16 @@ def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
     assert (found.kind, found.time_s, found.size) == (kind, 300.0, 60.0)
     rows[:, COLUMN[field]] = np.nan  # a bench without one
     assert weather_losses(level_of(rows)) == []
+
+
+@pytest.mark.parametrize(("quality", "kind"), [(0.0, "laser lost"), (np.nan, "optics lost")])
+def test_what_a_bench_is_held_by_is_what_it_has_lost(quality: float, kind: str) -> None:
+    rows, _ = night(4, 0.2, "quiet", [])
+    rows[:, COLUMN["displacement_quality"]] = quality  # figures have no code
+    time_s = column(rows, "mono_s")
+    rows[(time_s >= 300.0) & (time_s < 304.0), COLUMN["displacement_um"]] = np.nan
+    (found,) = laser_losses(level_of(rows))
+    assert (found.kind, found.time_s, found.size) == (kind, 300.0, 4.0)
 
 
 def test_a_step_and_a_gap() -> None:

@@ -119,10 +119,12 @@ def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
 
 
 def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
-    """The laser flagged its reading as bad, or gave none."""
-    bad = (level["max_displacement_quality"] > 0) | ~np.isfinite(level["mean_displacement_um"])
+    """The laser flagged its reading as bad, or gave none; on a bench held without one, the optics."""
+    quality, seen = level["max_displacement_quality"], np.isfinite(level["mean_displacement_um"])
+    bad = (quality > 0) | ~seen
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
-    return _losses("laser lost", bad, level, 1)
+    by_optics = seen.any() and not np.isfinite(quality).any()  # their readings have no code
+    return _losses("optics lost" if by_optics else "laser lost", bad, level, 1)
 
 
 def weather_losses(level: steps.Level) -> list[steps.FoundEvent]:

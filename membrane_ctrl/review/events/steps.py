@@ -96,8 +96,8 @@ Level = dict[str, FloatArray]
 class FoundEvent:
     """A detected event."""
 
-    # "pressure step", "leak step", "laser glitch", "laser lost", "barometer lost", "thermometer lost",
-    # "lateness burst", "noise change", "shape jump" or "excursion"
+    # "pressure step", "leak step", "laser glitch", "laser lost", "optics lost", "barometer lost",
+    # "thermometer lost", "lateness burst", "noise change", "shape jump" or "excursion"
     kind: str
     time_s: float  # time of the event
     start_s: float  # time range of the run that shows it
