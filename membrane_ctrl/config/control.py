@@ -239,8 +239,8 @@ class ShapeConfig(Section):
     """Figures per second in `track`, if camera and machine give that many. Lower it to leave more of the machine to
     others."""
     track_periods: Annotated[int, Field(ge=2, le=1000)] = 32
-    """Periods of the crossed fringes over the pattern. Lower it for a camera with few pixels; raise it where the
-    screen's light wanders over short distances."""
+    """Periods of the crossed fringes over the pattern; the mirror must show nine at least. Lower it for a camera with
+    few pixels; raise it where the screen's light wanders over short distances."""
     track_step_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
     """Interval between steps of the crossed fringes; five steps measure the light anew. Lower it for a screen whose
     light wanders within a minute."""

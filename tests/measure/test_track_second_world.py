@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.track.scene import scene_of
+from membrane_ctrl.metrology.track.tracker import Tracker
 from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld
 
 CLEAN = {
@@ -96,15 +102,18 @@ def test_each_effect_alone(tmp_path: Path, effect: str, capsys: pytest.CaptureFi
 
 @dataclass
 class BentWorld(CrossedWorld):
-    """The same with one more Noll term; the ring rests, so that the vertex moves."""
+    """The same with a deeper bowl and more of some Noll terms; the ring rests, so that the vertex moves."""
 
-    term: int = 2
-    amount_um: float = 0.0
+    deeper_um: float = 0.0
+    more_um: Mapping[int, float] = field(default_factory=dict)
+
+    def sag_um(self, t: float) -> float:
+        return super().sag_um(t) + self.deeper_um
 
     def _more_mm(self, x: Array, y: Array) -> Array:
-        place = np.ravel(x) / RADIUS_MM, np.ravel(y) / RADIUS_MM
-        height = zernike.values(*place)[self.term - 1] - zernike.at_vertex()[self.term - 1]
-        return np.asarray(1e-3 * self.amount_um * height.reshape(np.shape(x)))
+        terms = zernike.values(np.ravel(x) / RADIUS_MM, np.ravel(y) / RADIUS_MM)
+        heights = [1e-3 * um * (terms[j - 1] - zernike.at_vertex()[j - 1]) for j, um in self.more_um.items()]
+        return np.asarray(np.sum([np.zeros(np.size(x)), *heights], axis=0).reshape(np.shape(x)))
 
     def film_mm(self, x: Array, y: Array, t: float) -> Array:
         return np.asarray(super().film_mm(x, y, t) + self._more_mm(x, y))
@@ -133,7 +142,7 @@ def cramer_rao_um(noise_adu: float) -> Array:
     seen = light_of(BentWorld(**setup))  # type: ignore[arg-type]
     columns = []
     for term in range(2, 37):
-        more, less = (light_of(BentWorld(**setup, term=term, amount_um=a)) for a in (1.0, -1.0))  # type: ignore[arg-type]
+        more, less = (light_of(BentWorld(**setup, more_um={term: a})) for a in (1.0, -1.0))  # type: ignore[arg-type]
         columns.append((more - less)[:3].sum(axis=0) / 2)
     maps = zernike.values(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(36, *seen.shape[1:])
     every = np.array([*columns, *(wave * one for wave in seen[:3] for one in maps)]).reshape(35 + 108, -1)
@@ -158,3 +167,34 @@ def test_noise_is_near_the_cramer_rao_bound(
     with capsys.disabled():
         print(f"\nnoise {noise_adu}: {rms(ratio):.2f} of the bound, worst term {ratio.max():.2f}")
     assert 0.85 < rms(ratio) < 1.3
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("most_um", "most_mrad"), [(1000.0, 10.0), (200.0, 1.0), (50.0, 0.1)])
+def test_jumps_lose_no_order_silently(
+    tmp_path: Path, most_um: float, most_mrad: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The frame after a jump is refused, or right within its bar; whatever the laser says, which is not there."""
+    setup = CLEAN | {"width": 245, "height": 205, "pixel_um": 34.5}
+    still = BentWorld(**setup)  # type: ignore[arg-type]
+    still.write_reference(tmp_path / "full")
+    reference = Figures().of(tmp_path / "full")
+    optics = reference.head.optics
+    scene = scene_of(optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
+    tracker = Tracker(scene, (205, 245), 255, optics.camera.noise_adu)
+    first = tracker.follow(still.crossed(0.0), (0.0, 0.0), 0.0)
+    random, seen, wrong = np.random.default_rng(8), Counter[str](), []
+    for number in range(334):
+        deeper_um, tilt_mrad, azimuth = random.uniform((-most_um, 0, 0), (most_um, most_mrad, 2 * math.pi))
+        tilt_um = 1e3 * tilt_mrad * RADIUS_MM / 2e3  # Noll 2 and 3 have a slope of 2 / radius
+        tilt = {2: tilt_um * math.cos(azimuth), 3: tilt_um * math.sin(azimuth)}
+        jumped = BentWorld(**setup, seed=number, deeper_um=deeper_um, more_um=tilt)  # type: ignore[arg-type]
+        found = deepcopy(tracker).follow(jumped.crossed(0.0), (0.0, 0.0), 0.05)
+        seen[f"{found.verdict} {found.reason[:11]}"] += 1
+        off_um = np.array([found.sag_um - first.sag_um - deeper_um, *(found.coeffs_um - first.coeffs_um)[1:3]])
+        off_um[1:] -= tilt[2], tilt[3]
+        if found.verdict != "rejected" and not np.abs(off_um).max() < 0.5:
+            wrong.append(f"{deeper_um:.0f} um, {tilt_mrad:.2f} mrad: {found.verdict}, {off_um} um off")
+    with capsys.disabled():
+        print(f"\nup to {most_um:g} um, {most_mrad:g} mrad: {dict(seen)}")
+    assert wrong == []

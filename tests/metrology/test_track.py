@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracked import TrackedFrame
 from membrane_ctrl.metrology.track.tracker import Tracker
@@ -55,10 +55,22 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+def reference(tmp_path_factory: pytest.TempPathFactory) -> SetFigure:
     folder = tmp_path_factory.mktemp("track") / "full"
     simulate_set(folder, SimulationSpec(OPTICS, FILM))
-    reference = Figures().of(folder)
+    return Figures().of(folder)
+
+
+@pytest.mark.parametrize(
+    ("periods", "why"), [(12, "only 8 fringes across the mirror"), (120, r"only \d\.\d pixels a fringe")]
+)
+def test_fringes_that_tell_nothing_are_refused(reference: SetFigure, periods: int, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        scene_of(reference.head.optics, reference.checked, reference.figure, 398.56 / periods)
+
+
+@pytest.fixture(scope="module")
+def bench(reference: SetFigure) -> Bench:
     scene = scene_of(reference.head.optics, reference.checked, reference.figure, 12.455)
     return Bench(scene, Tracker(scene, SIZE, 255, OPTICS.camera.noise_adu))
 

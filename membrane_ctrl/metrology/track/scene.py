@@ -25,6 +25,9 @@ _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
 _RESPONSE_POWERS = (2, 3, 4, 5)
+# Across the mirror. Light is judged in squares of a twelfth of its diameter: with eight fringes, squares of a dark
+# part looked covered, and the error bars came out three times too small.
+_LEAST_FRINGES = 9
 _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
@@ -95,12 +98,16 @@ def scene_of(
     contrast : float
         Of the pattern, c in docs/interfaces.md.
 
-    Raises ValueError if the camera cannot resolve such fringes.
+    Raises ValueError if the camera cannot resolve such fringes, or the mirror shows too few.
     """
     camera, fine_px = optics.camera, checked.binned.bin_px
     tracer, shape = checked.tracer, figure.fit.surface
     rad_per_mm = 2 * math.pi / period_mm
     traced = tracer.predict_screen(figure.points, shape)
+    fringes = float(np.ptp(traced, axis=1).min()) / period_mm
+    if fringes < _LEAST_FRINGES:
+        seen = f"only {fringes:.0f} fringes across the mirror"
+        raise ValueError(f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period")
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
     fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
     coarser_rad = traced / phase.mm_per_rad(optics.pattern)  # the reference's errors repeat with its fringes
