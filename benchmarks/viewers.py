@@ -15,8 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
@@ -32,6 +32,7 @@ from aiohttp import ClientSession, CookieJar
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.run_files.run import open_run
 
+Beside = Callable[[str], AbstractContextManager[object]]
 VIEWERS, CYCLES, PHASE_S = 50, 4, 30.0
 _HOLDS_S = 25.0  # until the mirror is held
 _DROPPED_S = 60.0  # a stalled viewer is noticed within 24 s, its page forgotten 20 s later
@@ -165,11 +166,11 @@ def _phase(page: psutil.Process, viewed: subprocess.Popen[str] | None) -> Phase:
     return phase
 
 
-def phases_of(link: str, page: psutil.Process, count: int, cycles: int) -> Iterator[Phase]:
+def phases_of(link: str, page: psutil.Process, count: int, cycles: int, beside: Beside) -> Iterator[Phase]:
     """Phases without viewers and with, in turn."""
     for _ in range(cycles):
         yield _phase(page, None)
-        with viewers(link, count) as many, viewers(link, 1) as stalled:
+        with viewers(link, count) as many, viewers(link, 1) as stalled, beside(link):
             time.sleep(3.0)  # until something has been sent
             stalled.send_signal(signal.SIGSTOP)
             yield _phase(page, many)
@@ -188,12 +189,12 @@ def judge(phases: list[Phase], run: Path) -> None:
         phase.missed = int(missed[within][-1] - missed[within][0])
 
 
-def run(count: int = VIEWERS, cycles: int = CYCLES) -> list[Figure]:
-    """Figures of one hold."""
+def run(count: int = VIEWERS, cycles: int = CYCLES, beside: Beside = nullcontext) -> list[Figure]:
+    """Figures of one hold; `beside` opens one more viewer of the link for each of the cycles."""
     with tempfile.TemporaryDirectory() as folder:
         with hold_with_page(Path(folder)) as (_, page, link, run_folder):
             begin_mb = page.memory_info().rss / 1e6
-            phases = list(phases_of(link, page, count, cycles))
+            phases = list(phases_of(link, page, count, cycles, beside))
             grown_mb = page.memory_info().rss / 1e6 - begin_mb
             hung_up = (run_folder / "web.log").read_text().count("does not read: hung up")
         judge(phases, run_folder)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, connected
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import ring
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.run_files.run_folder import logged
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost
@@ -102,6 +105,8 @@ class HoldFeed:
         self._where = where
         self.seen = HoldSeen("")
         self.seconds = Seconds()
+        self.marks: deque[tuple[float, str]] = deque(maxlen=_EVENTS_KEPT)  # UTC seconds and text, since `met_s`
+        self.met_s = math.inf  # UTC of the present contact's begin
         self._events: deque[str] = deque(maxlen=_EVENTS_KEPT)
         self._ending = threading.Event()
         self._client: PortClient | None = None
@@ -159,6 +164,8 @@ class HoldFeed:
         if greeting["run"] != self.seen.name:
             self.seen = HoldSeen(str(greeting["run"]))
             self._events.clear()
+        self.marks.clear()  # those made without contact are in the runs' logs only
+        self.met_s = time.time()
         rings = self._rings()
         client.patience(10 * PERIOD_S)
         answer = client.ask(do="watch", period_s=PERIOD_S)
@@ -187,6 +194,8 @@ class HoldFeed:
         if "event" in message:
             utc = datetime.now(UTC)
             self._events.append(f"{utc:%H:%M:%S} UTC  {event_words(message['event'])}")
+            if isinstance(event := logged(message["event"]).event, Mark):
+                self.marks.append((utc.timestamp(), event.text))
         if "status" in message:
             self.seen = replace(
                 self.seen,
@@ -233,6 +242,7 @@ UNITS = {
 }  # fmt: skip
 _LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
 _POINTS_MAX = 1200  # as many as a wide screen shows
+_LISTED_S = 10.0  # the runs of a folder are listed anew so often
 _GAP = 3.0  # windows without data interrupt the line
 
 
@@ -262,6 +272,29 @@ def history(feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s
     return thinned(_joined([*parts, live]), span_s)
 
 
+@lru_cache(maxsize=32)  # each list opens every run of its folder
+def _entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
+    return catalogue.entries(logs)
+
+
+def marks(feed: HoldFeed, logs: Path | None, span_s: float, now_s: float | None = None) -> list[tuple[float, str]]:
+    """UTC seconds and texts of the marks in the last `span_s` seconds, oldest first; `logs` as for `history`."""
+    begin_s = (time.time() if now_s is None else now_s) - span_s
+    found = list(feed.marks)
+    if logs is not None and logs.is_dir() and begin_s < feed.met_s:
+        for entry in _entries(logs, time.monotonic() // _LISTED_S):
+            start_s = entry.started_utc.timestamp()
+            if not entry.marks or start_s > feed.met_s:
+                continue
+            with suppress(OSError, ValueError, errors.CommandError):  # as in `_of_runs`
+                found += [
+                    (start_s + each.mono_s, each.event.text)
+                    for each in open_run(entry.folder).log
+                    if isinstance(each.event, Mark) and start_s + each.mono_s < feed.met_s
+                ]
+    return sorted(each for each in found if each[0] >= begin_s)
+
+
 def _of_feed(feed: HoldFeed, signal: str, begin_s: float) -> Series:
     seconds = [each for each in feed.seconds.since(begin_s) if signal in each.values]
     values = np.array([each.values[signal] for each in seconds]).reshape(-1, 3)
@@ -273,7 +306,7 @@ def _of_runs(logs: Path, signal: str, begin_s: float, end_s: float, span_s: floa
     window_s = next((w for w in (1.0, 10.0) if span_s / w <= 4 * _POINTS_MAX), 60.0)
     names = [f"{kind}_{signal}" for kind in ("min", "mean", "max")]
     found = []
-    for entry in catalogue.entries(logs):
+    for entry in _entries(logs, time.monotonic() // _LISTED_S):
         start_s = entry.started_utc.timestamp()
         duration_s = entry.duration_s if math.isfinite(entry.duration_s) else 0.0
         if start_s > end_s or start_s + duration_s < begin_s:

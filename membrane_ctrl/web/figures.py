@@ -4,7 +4,7 @@ import asyncio
 import io
 import math
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Generic, TypeVar
@@ -17,6 +17,8 @@ from membrane_ctrl.run_files import shapes
 from membrane_ctrl.web.feed import UNITS, Series
 
 T = TypeVar("T")
+_GREY, _RULE = "#8a8a8a", "rgba(128, 128, 128, 0.3)"  # legible on white and on black
+_MARKS_MOST, _MARK_LETTERS = 20, 24  # newest marks on a chart, and what fits beside each
 
 REMOVED = {"nothing": 0, "piston, tilt": 3, "piston, tilt, defocus": 4}
 _BAND = {
@@ -34,27 +36,42 @@ class MapPicture:
     terms: dict[str, Any]  # options of their chart
 
 
-def chart(signal: str, series: Series, utc: bool, span_s: float) -> dict[str, Any]:
-    """Options of the history chart (ECharts): the mean, and the band between least and largest value."""
+def chart(signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, str]] = ()) -> dict[str, Any]:
+    """Options of the history chart (ECharts): the mean, the band between least and largest value, and the marks.
+
+    `marks` are UTC seconds and texts, oldest first.
+    """
     shift_ms = 0.0 if utc else _offset_s(series) * 1e3
     at_ms = series.utc_s * 1e3 + shift_ms
+    lines = [{"xAxis": at_s * 1e3 + shift_ms, "name": text[:_MARK_LETTERS]} for at_s, text in marks[-_MARKS_MOST:]]
     low, mean, high = ([[t, _plain(v)] for t, v in zip(at_ms, y, strict=True)] for y in _stacked(series))
     options: dict[str, Any] = {
         "animation": False,
         "useUTC": True,  # the local time is in the values: ECharts knows no time zone of the bench
         "grid": {"left": 64, "right": 16, "top": 24, "bottom": 64},
         "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "time", "name": "UTC" if utc else "local time", "nameGap": 28, "nameLocation": "middle"},
-        "yAxis": {"type": "value", "scale": True, "name": UNITS[signal], "nameLocation": "middle", "nameGap": 48},
+        "xAxis": {**_axis("UTC" if utc else "local time", 28), "type": "time"},
+        "yAxis": {**_axis(UNITS[signal], 48), "type": "value", "scale": True},
         "dataZoom": [{"type": "inside"}, {"type": "slider", "height": 18, "bottom": 6}],
         "series": [
             {**_BAND, "data": low},
             {**_BAND, "data": high, "areaStyle": {"color": "#1f77b4", "opacity": 0.25}},
             {"type": "line", "name": UNITS[signal], "symbol": "none", "data": mean, "lineStyle": {"width": 1.5},
-             "itemStyle": {"color": "#1f77b4"}},
+             "itemStyle": {"color": "#1f77b4"}, "markLine": _mark_lines(lines)},
         ],
     }  # fmt: skip
     return options
+
+
+def _axis(name: str, gap_px: int) -> dict[str, Any]:
+    label = {"color": _GREY, "hideOverlap": True}
+    place = {"name": name, "nameGap": gap_px, "nameLocation": "middle", "nameTextStyle": {"color": _GREY}}
+    return {**place, "axisLabel": label, "splitLine": {"lineStyle": {"color": _RULE}}}
+
+
+def _mark_lines(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    label = {"formatter": "{b}", "color": _GREY, "position": "insideEndTop", "fontSize": 10}
+    return {"symbol": "none", "animation": False, "lineStyle": {"color": _GREY}, "label": label, "data": lines}
 
 
 def _stacked(series: Series) -> tuple[Column, Column, Column]:
@@ -80,8 +97,8 @@ def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[
         "animation": False,
         "grid": {"left": 56, "right": 12, "top": 16, "bottom": 40},
         "tooltip": {"trigger": "axis"},
-        "xAxis": {"type": "category", "data": [f"Z{j}" for j in range(4, 37)]},
-        "yAxis": {"type": "value", "name": "um"},
+        "xAxis": {**_axis("", 0), "type": "category", "data": [f"Z{j}" for j in range(4, 37)]},
+        "yAxis": {**_axis("um", 40), "type": "value"},
         "series": [
             {"type": "bar", "name": "change, um", "data": [_plain(v) for v in change_um[3:]]},
             {"type": "scatter", "name": "sigma, um", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[3:]]},

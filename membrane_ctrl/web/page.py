@@ -13,8 +13,17 @@ from nicegui import ui
 
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
-from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history
-from membrane_ctrl.web.panels import CHOOSES, SessionWatch, TuningPanel, alarms_of, fleet_panel, fresh, runs_panel
+from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history, marks
+from membrane_ctrl.web.panels import (
+    CHOOSES,
+    SessionWatch,
+    TuningPanel,
+    alarms_of,
+    fleet_panel,
+    fresh,
+    runs_panel,
+    tell,
+)
 
 _LOOK_S = 1.0
 _FETCH_S = 30.0  # for a browser to fetch a chart
@@ -26,6 +35,8 @@ _FIGURES = (
     ("air", "air_temperature_c", "°C", 2), ("gas", "gas_temperature_c", "°C", 2), ("late", "lateness_ms", "ms", 1),
     ("missed ticks", "missed_ticks", "", 0),
 )  # fmt: skip
+_CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"  # a phone is narrow
+_PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
 _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
 
 
@@ -45,7 +56,8 @@ class SharedViews:
     def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
         """Options of the history chart, as JSON in gzip."""
         feed, span_s = self._feeds[hold], SPANS_S[span]
-        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, span_s)
+        made = marks(feed, feed.logs, span_s)
+        options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, made)
         return gzip.compress(json.dumps(options).encode(), 1)
 
     def _map(self, hold: str, removed: str, _time_s: float) -> figures.MapPicture:
@@ -69,10 +81,13 @@ class WebPage:
         self._drawn: tuple[float, str] = (0.0, "")
         self._coloured = ""
         self._buttons: list[tuple[ui.button, Action]] = []
+        self._asking = False
 
     def build(self) -> None:
         """Put the page together."""
         self._dark = ui.dark_mode(None)
+        ui.add_css(_CSS)
+        ui.colors(primary=_PRIMARY)
         with ui.header().classes("items-center justify-between q-py-xs"):
             self._name = ui.label().classes("text-h6")
             self._state = ui.badge().classes("text-body1 q-pa-sm").props('aria-label="state"')
@@ -99,7 +114,13 @@ class WebPage:
                     tabs.on_value_change(lambda event: load() if event.value == look_back.props["name"] else None)
                 with ui.tab_panel(tune):
                     TuningPanel(lambda: self._views.sessions.get(self._hold), self._user, self._may_choose)
-        ui.keyboard(on_key=self._key)
+        with ui.footer().classes("justify-center q-pa-xs !bg-white dark:!bg-[#121212]"):  # always on the screen
+            stop = ui.button(STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP))
+            stop.classes("text-h6").style("width: min(100%, 24rem)").tooltip(STOP.does)
+            self._buttons.append((stop, STOP))
+        # a button that was clicked keeps the focus: the keys work there, too
+        ui.keyboard(on_key=self._key, repeating=False, ignore=["input", "select", "textarea"])
+        self._look()
         ui.timer(_LOOK_S, self._look)
         ui.timer(_LOOK_S, self._draw)
 
@@ -141,11 +162,8 @@ class WebPage:
         with ui.grid(columns=3).classes("w-full gap-1"):
             for action in ACTIONS:
                 button = ui.button(action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a))
-                button.props("dense no-caps").tooltip(action.does)
+                button.props("dense no-caps stack").tooltip(action.does)
                 self._buttons.append((button, action))
-        stop = ui.button(STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP))
-        stop.classes("w-full text-h6").tooltip(STOP.does)
-        self._buttons.append((stop, STOP))
 
     def _build_figure(self) -> None:
         with ui.row().classes("items-center"):
@@ -204,7 +222,7 @@ class WebPage:
         colour = "grey" if silent else _COLOURS.get(state, "warning")
         if colour != self._coloured:
             self._coloured = colour
-            self._state.props(f"color={colour}")
+            self._state.props(f"color={colour} text-color={'white' if colour == 'negative' else 'black'}")
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._alarm.set_text(alarms_of(status))
         for _, field, _, digits in _FIGURES:
@@ -227,27 +245,39 @@ class WebPage:
 
     async def _confirm(self, action: Action) -> None:
         """Ask for the input and for a confirmation, send, and say what became of it."""
+        if self._asking:  # a key beside the open dialog
+            return
         with ui.dialog() as dialog, ui.card():
             ui.label(action.label).classes("text-h6")
             ui.label(action.does)
-            given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").props("autofocus")
-            given.set_visibility(bool(action.asks))
-            given.on("keydown.enter", lambda: dialog.submit("yes"))
+            given = None
+            if action.asks:  # a hidden one would take the focus, and Enter with it
+                given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").classes("w-full")
+                given.props(f'autofocus inputmode="{"decimal" if action.asks == "number" else "text"}"')
+                given.on("keydown.enter", lambda: dialog.submit("yes"))
             take_over = ui.checkbox("take command from whoever has it")
             with ui.row():
-                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
+                sure = ui.button("Do it", on_click=lambda: dialog.submit("yes"))
+                sure.props("color=primary" if action.asks else "color=primary autofocus")
                 ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
-        answer = await dialog
-        dialog.delete()
+        self._asking = True
+        try:
+            answer = await dialog
+        finally:
+            self._asking = False
+        if not dialog.is_deleted:  # with the viewer
+            dialog.delete()
         if not answer:
             return
         if not may(self._user, self._feed.seen.role, action):  # the role may have changed while the dialog was open
-            ui.notify(f"{action.label}: needs the role {action.role}", type="negative")
+            tell(f"{action.label}: needs the role {action.role}", good=False)
             return
         try:
-            asked = request(action, f"web: {self._user.name}", str(given.value or ""), bool(take_over.value))
+            asked = request(
+                action, f"web: {self._user.name}", str(given.value or "") if given else "", bool(take_over.value)
+            )
         except ValueError as error:
-            ui.notify(str(error), type="negative")
+            tell(str(error), good=False)
             return
         said = await asyncio.to_thread(self._feed.ask, asked)
-        ui.notify(said, type="positive" if said.endswith(": done") else "negative", timeout=8000)
+        tell(said, said.endswith(": done"))

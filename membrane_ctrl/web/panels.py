@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import quote
 
 from nicegui import ui
@@ -28,8 +28,20 @@ from membrane_ctrl.web.feed import HoldFeed
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
 _LOOK_S = 1.0
+_CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
+<q-checkbox dense v-model="props.selected" :label="props.row.run" />
+<div class="row justify-between q-mt-xs">
+<span v-for="col in props.cols.filter(c => !['run', 'error'].includes(c.name))">
+<span class="text-caption">{{ col.label }}</span> {{ col.value ?? '-' }}</span></div>
+<span v-html="props.row.error"></span></q-card></div>"""  # a run on a phone, which has no room for the table
 _TAKES = 5  # looks until a session that asks has taken an answer
 CHOOSES: Role = "tune"  # as for `ctl gains`
+
+
+def tell(text: str, good: bool | None = None) -> None:
+    """Show the viewer a message for some seconds, away from the stop button."""
+    kind: Literal["positive", "negative"] | None = None if good is None else "positive" if good else "negative"
+    ui.notify(text, type=kind, position="top", timeout=5000 if good is None else 8000)
 
 
 def alarms_of(status: Mapping[str, Any]) -> str:
@@ -122,15 +134,18 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
         )
     ]  # fmt: skip
     table = ui.table(columns=columns, rows=[], row_key="run", selection="single", pagination=20).classes("w-full")
+    table.props(':grid="window.innerWidth < 700" no-data-label="reading the runs"')
     table.add_slot("body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>')
+    table.add_slot("item", _CARD)
 
     async def load() -> None:
         table.rows = [_cells(line, utc()) for line in await asyncio.to_thread(run_lines, logs)]
+        table.props('no-data-label="no runs in this folder"')
         table.update()
 
     def chosen() -> Path | None:
         if not table.selected:
-            ui.notify("Select a run first.")
+            tell("Select a run first.")
             return None
         return run_folder(logs, str(table.selected[0]["run"]))
 
@@ -139,9 +154,9 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
         if folder is None:
             return
         if not (folder / REPORT).exists():
-            ui.notify("Writing the report.")
+            tell("Writing the report.")
         if said := await asyncio.to_thread(report_problem, folder, user):
-            ui.notify(said, type="negative", timeout=10_000)
+            tell(said, good=False)
             return
         ui.navigate.to(f"/report/{folder.name}?hold={quote(hold)}", new_tab=True)
 
@@ -149,7 +164,7 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
         folder = chosen()
         if folder is not None:
             ui.clipboard.write(f"membrane-ctrl review {folder}")
-            ui.notify("Copied the command that opens this run in Rerun; run it on your desktop.")
+            tell("Copied the command that opens this run in Rerun; run it on your desktop.")
 
     with ui.row():
         ui.button("Refresh", icon="refresh", on_click=load).props("flat")
@@ -268,6 +283,7 @@ class TuningPanel:
         self._steps = ui.row()
         self._choice = ui.column().classes("w-full")
         self._said = ui.log(max_lines=200).classes("w-full h-64").props('aria-label="results"')
+        self._said.set_visibility(False)
         self._buttons: list[ui.button] = []
         self._seen: SessionSeen | None = None
         ui.timer(_LOOK_S, self._show)
@@ -281,6 +297,7 @@ class TuningPanel:
             return
         self._seen = seen
         self._head.set_text(seen.head)
+        self._said.set_visibility(True)
         if before is None or before.path != seen.path:
             self._said.clear()
             before = SessionSeen(seen.path, frozenset(), Progressed())
@@ -326,9 +343,10 @@ class TuningPanel:
                 ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
                 ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
         sure = await dialog
-        dialog.delete()
+        if not dialog.is_deleted:  # with the viewer
+            dialog.delete()
         if not sure or not self._may():
             return
         given = PageAnswer(said, self._user.name)
         outcome = await asyncio.to_thread(answered, seen.path, seen.progress.asks, given)
-        ui.notify(outcome, type="positive" if outcome.endswith(": done") else "negative", timeout=8000)
+        tell(outcome, outcome.endswith(": done"))

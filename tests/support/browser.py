@@ -65,9 +65,28 @@ class Tab:
         await self.until(f"!!({_FIND})(document, {json.dumps(label)})")
         await self.value(f"({_FIND})(document, {json.dumps(label)}).click()")
 
-    async def screenshot(self, path: Path) -> None:
-        """Write a picture of the whole page."""
-        found = await self.call("Page.captureScreenshot", captureBeyondViewport=True)
+    async def press(self, *keys: str) -> None:
+        """Press keys one after the other, such as `s`, `Enter` or `Tab`."""
+        codes = {"Enter": 13, "Tab": 9, "Escape": 27}
+        for key in keys:
+            pressed: dict[str, Any] = {"key": key, "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper()))}
+            text = {"text": "\r" if key == "Enter" else key} if key == "Enter" or len(key) == 1 else {}
+            await self.call("Input.dispatchKeyEvent", type="keyDown", **pressed, **text)
+            await self.call("Input.dispatchKeyEvent", type="keyUp", **pressed)
+
+    async def show_as(self, width: int, height: int, dark: bool = False) -> None:
+        """Show the page as on a screen of that size, a phone if it is narrow, by day or by night."""
+        await self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
+                        mobile=width < 600)  # fmt: skip
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        await self.call("Emulation.setEmulatedMedia", features=[scheme])
+        await self.value("window.before = true")
+        await self.call("Page.reload")
+        await self.until("!window.before && document.readyState === 'complete'")
+
+    async def screenshot(self, path: Path, whole: bool = True) -> None:
+        """Write a picture of the whole page, or of what is on the screen."""
+        found = await self.call("Page.captureScreenshot", captureBeyondViewport=whole)
         await asyncio.to_thread(path.write_bytes, base64.b64decode(found["data"]))
 
 

@@ -1,13 +1,15 @@
 """The pictures of README and documentation, taken anew: `make pictures`, or `python -m tests.support.pictures run-*`.
 
-Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for the report, Chromium. Each picture
-is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails, sets
+Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for report and page, Chromium. Each
+picture is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails, sets
 of a screen bowed by 1 mm.
 """
 
 from __future__ import annotations
 
+import asyncio
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -21,9 +23,14 @@ import numpy as np
 
 from benchmarks.nights import DOOR, GLITCH, JUMP, LEAK, Planted
 from firmware_iface.roles import BenchReading
+from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.review.viewer.viewer import screenshot
+from tests.support.browser import browser_tab
 from tests.support.review_runs import written
+from tests.support.slowed_holds import slowed_holds
 from tests.support.virtual_record import kept_ticks, write_record
+from tests.web.test_fleet import fleet_file
+from tests.web.test_page import PRESS, served
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 _WIDTH_PX = 1280  # of a tab of the review, beside others on its page
@@ -93,6 +100,69 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
     return {"calibration-bowed-screen": (folder / "geometry-residuals.png").read_bytes()}
 
 
+def page_pictures(folder: Path) -> dict[str, bytes]:
+    """The page of a hold, in a control room and on a phone."""
+    (folder / "lab.toml").write_text("[twin]\nport = 0\n")
+    words = ["hold", "--twin", "--config", folder / "lab.toml", "--name", "night", "--logs", folder]
+    hold = subprocess.Popen([sys.executable, "-m", "membrane_ctrl", *map(str, words)], stdin=subprocess.DEVNULL)
+    try:
+        return asyncio.run(_page_pictures(folder))
+    finally:
+        hold.send_signal(signal.SIGINT)
+        hold.wait(120.0)
+
+
+async def _page_pictures(folder: Path) -> dict[str, bytes]:
+    socket, target = ("--socket", folder / "control.sock"), folder / "page.png"
+    phone: list[AnyArray] = []
+    async with served(folder) as link, browser_tab(link, folder / "profile") as tab:
+        for text, after_s in (("door opened", 90.0), ("lights off", 120.0)):
+            await asyncio.sleep(after_s)
+            await asyncio.to_thread(command, "ctl", "mark", text, *socket)
+        await tab.show_as(1500, 1560)
+        await asyncio.sleep(20.0)
+        await tab.screenshot(target, whole=False)
+        room = await asyncio.to_thread(target.read_bytes)
+        steps = (
+            "",
+            "document.querySelector('canvas').scrollIntoView()",
+            PRESS.format("LOOK BACK"),
+            PRESS.format("NOW"),
+        )
+        for dark, asked in ((False, steps[:2]), (True, steps[2:])):
+            await tab.show_as(390, 844, dark)
+            for step in asked:
+                await asyncio.sleep(10.0)
+                await tab.value(f"{step}; 0")
+                if step == PRESS.format("NOW"):
+                    await tab.click("bookmarkMark")
+                await asyncio.sleep(5.0)
+                await tab.screenshot(target, whole=False)
+                phone += [cv2.imread(str(target)), np.full((844, 20, 3), 255, np.uint8)]
+    return {"web": room, "web-phone": cv2.imencode(".png", np.hstack(phone[:-1]))[1].tobytes()}
+
+
+def fleet_picture(folder: Path) -> dict[str, bytes]:
+    """The page of six holds, one of which has ended."""
+    names = ["north", "south", "east", "west", "spare", "bench"]
+    with slowed_holds(folder, 1.0, names) as holds:
+        return {"web-fleet": asyncio.run(_fleet_picture(folder, names, holds))}
+
+
+async def _fleet_picture(folder: Path, names: list[str], holds: subprocess.Popen[str]) -> bytes:
+    options = ("--fleet", str(fleet_file(folder, *names)))
+    async with served(folder, *options) as link, browser_tab(link, folder / "profile") as tab:
+        await asyncio.sleep(60.0)
+        await asyncio.to_thread(command, "ctl", "manual", 1.2, "--socket", folder / "east" / "control.sock")
+        assert holds.stdin is not None
+        holds.stdin.write("end spare\n")
+        holds.stdin.flush()
+        await tab.show_as(1500, 1000, dark=True)
+        await asyncio.sleep(20.0)
+        await tab.screenshot(folder / "fleet.png", whole=False)
+    return await asyncio.to_thread((folder / "fleet.png").read_bytes)
+
+
 def _tab(folder: Path, *asked: object) -> bytes:
     target = folder / "tab.png"
     command("review", *asked, "--screenshot", target)
@@ -120,6 +190,8 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("review-faults",): faults_picture,
     ("review-catalogue",): catalogue_picture,
     ("calibration-bowed-screen",): bowed_picture,
+    ("web", "web-phone"): page_pictures,
+    ("web-fleet",): fleet_picture,
 }
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ import pytest
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, thinned
+from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, marks, thinned
 
 NOW_S = 1_800_000_000.0
 
@@ -68,6 +71,28 @@ def test_a_month_is_thinned_and_keeps_its_extremes() -> None:
     assert np.nanmin(series.low) == pytest.approx((mean - 1).min())
 
 
+def test_marks_are_the_feeds_and_those_of_the_runs_before(tmp_path: Path) -> None:
+    origin = datetime.fromtimestamp(NOW_S - 600.0, UTC)
+    told = [(0.0, {"kind": "started"})]
+    for at_s, text in ((-700.0 + 600.0, "too early"), (100.0, "door"), (550.0, "seen by the feed, too")):
+        told.append((at_s, {"kind": "command", "command": "mark", "who": "anna", "why": "", "text": text}))
+    run = tmp_path / f"{origin:%Y%m%dT%H%M%SZ}-night"
+    run.mkdir()
+    stamped = [
+        {"time_utc": (origin + timedelta(seconds=at_s)).isoformat(), "mono_s": at_s} | line for at_s, line in told
+    ]
+    (run / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in stamped))
+    (tmp_path / "20260101T000000Z-torn").mkdir()
+    (tmp_path / "20260101T000000Z-torn" / "events.jsonl").write_text('{"kind":')
+    feed = HoldFeed(Where())
+    assert marks(feed, None, 600.0, NOW_S) == [], "no page has seen one, and the runs are elsewhere"
+    assert [text for _, text in marks(feed, tmp_path, 600.0, NOW_S)] == ["door", "seen by the feed, too"]
+    feed.met_s = NOW_S - 60.0
+    feed.marks.append((NOW_S - 49.5, "seen by the feed, too"))
+    assert marks(feed, tmp_path, 600.0, NOW_S) == [(NOW_S - 500.0, "door"), (NOW_S - 49.5, "seen by the feed, too")]
+    assert marks(feed, tmp_path, 55.0, NOW_S) == [(NOW_S - 49.5, "seen by the feed, too")]
+
+
 def test_values_that_are_missing_stay_missing() -> None:
     nan = np.full(10, math.nan)
     series = thinned(Series(np.arange(10.0), nan, nan, nan), 10.0)
@@ -80,6 +105,11 @@ def test_sparklines_and_charts_are_drawn_of_anything() -> None:
     assert sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
     assert 'd="M' in sparkline([5.0, 5.0])
     series = Series(np.array([1.0, 2.0]), np.array([0.0, math.nan]), np.array([1.0, math.nan]), np.array([2.0, 1.0]))
-    options = figures.chart("error_um", series, True, 60.0)
+    options = figures.chart("error_um", series, True)
+    assert options["series"][2]["markLine"]["data"] == [], "earlier marks do not stay"
+    many = [(float(number), "x" * 30) for number in range(30)]
+    lines = figures.chart("error_um", series, True, many)["series"][2]["markLine"]["data"]
+    assert [line["xAxis"] for line in lines] == [1e3 * number for number in range(10, 30)]
+    assert {line["name"] for line in lines} == {"x" * 24}
     assert options["series"][2]["data"] == [[1000.0, 1.0], [2000.0, None]]
     assert options["series"][1]["data"][0] == [1000.0, 2.0], "the band's width above its lower edge"

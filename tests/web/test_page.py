@@ -97,6 +97,71 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         await tab.screenshot(tmp_path / "page.png")
 
 
+STOP = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('STOP'))"
+FITS = f"""(() => {{ const page = document.documentElement, place = {STOP}.getBoundingClientRect();
+return page.scrollWidth <= page.clientWidth && place.top > 0 && place.bottom <= innerHeight }})()"""
+# of the text of an element to what is behind it, as WCAG defines it: 4.5 is legible
+CONTRAST = """(element => {
+  const light = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).map(v => v / 255)
+    .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4); return 0.2126 * r + 0.7152 * g + 0.0722 * b };
+  let behind = element;
+  while (behind && getComputedStyle(behind).backgroundColor.startsWith('rgba')) behind = behind.parentElement;
+  const back = behind ? getComputedStyle(behind).backgroundColor : 'rgb(255, 255, 255)';
+  const [low, high] = [light(getComputedStyle(element).color), light(back)].sort((a, b) => a - b);
+  return (high + 0.05) / (low + 0.05) })"""
+
+
+@needs_browser
+@pytest.mark.real_time
+@pytest.mark.campaign
+async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
+    async with viewed(tmp_path) as (run, tab):
+        for dark in (True, False):
+            await tab.show_as(390, 844, dark)
+            await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
+            for name, has in (("LOOK BACK", "REFRESH"), ("TUNE", "No tuning session"), ("NOW", "0.25")):
+                await tab.value(PRESS.format(name))
+                await tab.until(f"document.querySelector('[role=tabpanel]').innerText.includes('{has}') && {FITS}")
+                await asyncio.sleep(1.0)  # until the page has answered, which knows the open tab, too
+            for what in (
+                "[data-field=error_um]",
+                "[aria-label=state]",
+                ".nicegui-log",
+                "header .text-caption",
+                "button",
+            ):
+                assert await tab.value(f"{CONTRAST}(document.querySelector('{what}'))") > 4.5, (what, dark)
+            await tab.screenshot(tmp_path / f"phone{dark:d}.png")
+        chart = "getElement(+document.querySelector('canvas').closest('[id^=c]').id.slice(1)).chart"
+        await tab.until(f"{chart}.getOption().dataZoom.length === 2")
+        await tab.value(f"{chart}.dispatchAction({{type: 'dataZoom', start: 40, end: 90}}), 0")
+        fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/chart?')).length"
+        before = await tab.value(fetched)
+        await tab.until(f"{fetched} > {before} + 1")
+        zoom = f"{chart}.getOption().dataZoom.map(z => [z.start, z.end])"
+        assert await tab.value(zoom) == [[40, 90], [40, 90]], "new data leave the viewer's zoom"
+        await tab.press("m")
+        await tab.until("document.activeElement.tagName === 'INPUT'")
+        await tab.press(*"shut", "Enter")
+        await tab.until("document.body.innerText.includes('mark: done')")
+        focus = "document.activeElement.innerText"
+        for _ in range(60):
+            await tab.press("Tab")
+            if "Pause" in await tab.value(focus):
+                break
+        await tab.press("Enter")
+        await tab.until(f"{focus}.trim() === 'DO IT'")
+        await tab.press("Escape")
+        await tab.until("!document.querySelector('.q-dialog__inner')")
+        await tab.until(f"{focus}.includes('Pause')")
+        await asyncio.sleep(1.0)
+        await tab.press("s")  # though a button has the focus
+        await tab.until(f"{focus}.trim() === 'DO IT'")
+        await tab.press("h", "s", "Enter")
+        await tab.until("document.body.innerText.includes('stop: done')")
+        assert [(each.kind, each.text) for each in run.asked] == [("mark", "shut"), ("stop", "")]
+
+
 CANDIDATES = """| candidate | K 1/s | std um | Ms | against present |
 |---|---:|---:|---:|---:|
 | present | 0.300 | 0.210 +- 0.010 | 1.35 | in force |
