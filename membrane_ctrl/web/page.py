@@ -259,7 +259,7 @@ class WebPage:
             with ui.row():
                 sure = ui.button("Do it", on_click=lambda: dialog.submit("yes"))
                 sure.props("color=primary" if action.asks else "color=primary autofocus")
-                ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
+                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
         self._asking = True
         try:
             answer = await dialog

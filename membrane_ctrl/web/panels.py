@@ -137,6 +137,7 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
     table.props(':grid="window.innerWidth < 700" no-data-label="reading the runs"')
     table.add_slot("body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>')
     table.add_slot("item", _CARD)
+    table.add_slot("no-data", '<span class="q-pa-sm">{{ props.message }}</span>')
 
     async def load() -> None:
         table.rows = [_cells(line, utc()) for line in await asyncio.to_thread(run_lines, logs)]
@@ -167,9 +168,9 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
             tell("Copied the command that opens this run in Rerun; run it on your desktop.")
 
     with ui.row():
-        ui.button("Refresh", icon="refresh", on_click=load).props("flat")
-        ui.button("Report", icon="description", on_click=report).props("flat")
-        ui.button("Open in Rerun", icon="timeline", on_click=review).props("flat")
+        ui.button("Refresh", icon="refresh", on_click=load, color=None).props("flat")
+        ui.button("Report", icon="description", on_click=report, color=None).props("flat")
+        ui.button("Open in Rerun", icon="timeline", on_click=review, color=None).props("flat")
     return load
 
 
@@ -341,7 +342,7 @@ class TuningPanel:
             ui.label(f"{seen.progress.asks} {said or 'none'}").classes("text-h6")
             with ui.row():
                 ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
-                ui.button("Cancel", on_click=lambda: dialog.submit("")).props("flat")
+                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
         sure = await dialog
         if not dialog.is_deleted:  # with the viewer
             dialog.delete()
@@ -349,4 +350,5 @@ class TuningPanel:
             return
         given = PageAnswer(said, self._user.name)
         outcome = await asyncio.to_thread(answered, seen.path, seen.progress.asks, given)
-        tell(outcome, outcome.endswith(": done"))
+        with self._steps:  # the button that was pressed is gone once the session has its answer
+            tell(outcome, outcome.endswith(": done"))

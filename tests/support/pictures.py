@@ -1,8 +1,8 @@
 """The pictures of README and documentation, taken anew: `make pictures`, or `python -m tests.support.pictures run-*`.
 
 Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for report and page, Chromium. Each
-picture is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails, sets
-of a screen bowed by 1 mm.
+picture is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails,
+sets of a screen bowed by 1 mm.
 """
 
 from __future__ import annotations
@@ -104,7 +104,9 @@ def page_pictures(folder: Path) -> dict[str, bytes]:
     """The page of a hold, in a control room and on a phone."""
     (folder / "lab.toml").write_text("[twin]\nport = 0\n")
     words = ["hold", "--twin", "--config", folder / "lab.toml", "--name", "night", "--logs", folder]
-    hold = subprocess.Popen([sys.executable, "-m", "membrane_ctrl", *map(str, words)], stdin=subprocess.DEVNULL)
+    none = subprocess.DEVNULL
+    run = [sys.executable, "-m", "membrane_ctrl", *map(str, words)]
+    hold = subprocess.Popen(run, stdin=none, stdout=none, stderr=none)
     try:
         return asyncio.run(_page_pictures(folder))
     finally:
@@ -134,8 +136,11 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
             for step in asked:
                 await asyncio.sleep(10.0)
                 await tab.value(f"{step}; 0")
+                if step == PRESS.format("LOOK BACK"):
+                    await tab.until("document.querySelector('[role=tabpanel]').innerText.includes('night')")
                 if step == PRESS.format("NOW"):
                     await tab.click("bookmarkMark")
+                    await tab.until("document.body.innerText.includes('DO IT')")
                 await asyncio.sleep(5.0)
                 await tab.screenshot(target, whole=False)
                 phone += [cv2.imread(str(target)), np.full((844, 20, 3), 255, np.uint8)]
@@ -145,14 +150,14 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
 def fleet_picture(folder: Path) -> dict[str, bytes]:
     """The page of six holds, one of which has ended."""
     names = ["north", "south", "east", "west", "spare", "bench"]
-    with slowed_holds(folder, 1.0, names) as holds:
+    with slowed_holds(folder, 3.0, names) as holds:
         return {"web-fleet": asyncio.run(_fleet_picture(folder, names, holds))}
 
 
 async def _fleet_picture(folder: Path, names: list[str], holds: subprocess.Popen[str]) -> bytes:
     options = ("--fleet", str(fleet_file(folder, *names)))
     async with served(folder, *options) as link, browser_tab(link, folder / "profile") as tab:
-        await asyncio.sleep(60.0)
+        await asyncio.sleep(120.0)
         await asyncio.to_thread(command, "ctl", "manual", 1.2, "--socket", folder / "east" / "control.sock")
         assert holds.stdin is not None
         holds.stdin.write("end spare\n")

@@ -122,6 +122,9 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
             for name, has in (("LOOK BACK", "REFRESH"), ("TUNE", "No tuning session"), ("NOW", "0.25")):
                 await tab.value(PRESS.format(name))
                 await tab.until(f"document.querySelector('[role=tabpanel]').innerText.includes('{has}') && {FITS}")
+                if name == "LOOK BACK":
+                    refresh = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('REFRESH'))"
+                    assert await tab.value(f"{CONTRAST}({refresh})") > 4.5
                 await asyncio.sleep(1.0)  # until the page has answered, which knows the open tab, too
             for what in (
                 "[data-field=error_um]",
