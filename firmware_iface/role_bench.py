@@ -112,6 +112,10 @@ class RoleBench:
             pump, vent = await self._actuators()
         finally:
             sample, gauge_pa, ambient_pa, air_c = await sensors
+        if sample.quality == NO_ANSWER and math.isfinite(gauge_pa):
+            # the laser is lost, or there is none, and the bench is not: counted downwards, as no laser does
+            sample = replace(sample, sample_counter=min(sample.sample_counter, 0) - 1, device_time_s=self._clock())
+            self._last_sample = sample
         return roles.BenchReading(
             displacement_um=sample.displacement_um,
             displacement_quality=sample.quality,
@@ -186,12 +190,9 @@ class RoleBench:
 
     async def _sample(self) -> roles.DisplacementSample:
         """The newest sample; without one, the last counter and time, which then do not advance."""
-        last, laser = self._last_sample, self._devices.displacement
-        if laser is None:  # the other sensors' answers count
-            self._last_sample = replace(last, sample_counter=last.sample_counter + 1, device_time_s=self._clock())
-            return self._last_sample
-        self._last_sample = replace(last, displacement_um=math.nan, quality=NO_ANSWER)
-        if "displacement" not in self._tasks:
+        laser = self._devices.displacement
+        self._last_sample = replace(self._last_sample, displacement_um=math.nan, quality=NO_ANSWER)
+        if laser is not None and "displacement" not in self._tasks:
             try:
                 self._last_sample = await answer("displacement", laser.displacement())
             except roles.LinkError as error:
