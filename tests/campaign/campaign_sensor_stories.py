@@ -10,6 +10,7 @@ from campaign_stage import Stage, sensors_say
 from campaign_times import DISPLACEMENT_MAX_UM, TICK_S
 from campaign_world import World
 
+from membrane_ctrl.config.schema import EstimatorConfig, ShapeConfig
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.telemetry import State
 
@@ -98,6 +99,53 @@ def a_creeping_laser_without_a_camera() -> list[str]:
     stage = Stage().held()
     stage.wait(60.0)
     stage.wait(300.0, creeping(stage, 1.0, 70.0))
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def by_optics() -> Stage:
+    """A held bench without a laser, with ten figures a second."""
+    world = World()
+    config = config_of(1, world, False)
+    return Stage(
+        world=world,
+        camera=True,
+        config=config.model_copy(
+            update={
+                "estimator": EstimatorConfig(process_value="optics"),
+                "shape": ShapeConfig(mode="track", track_rate_hz=10.0),
+                "twin": config.twin.model_copy(update={"laser": False}),
+            }
+        ),
+    ).held()
+
+
+def a_camera_lost_on_a_bench_without_a_laser() -> list[str]:
+    """Nothing sees the film any more: the mean flow, then the pump off."""
+    stage = by_optics()
+    stage.wait(10.0)
+    stage.bench.wrong.camera_lost = True
+    before_um = stage.plant.truth().displacement_um
+    stage.wait(8.0)
+    went_um = stage.plant.truth().displacement_um - before_um
+    stage.must(abs(went_um) < 10.0, f"went {went_um:.0f} um without a figure")
+    stage.until(State.FAULT, 6.0)
+    stage.wait(8.0)
+    stage.wait(5.0, stage.still)
+    return stage.violations
+
+
+def optics_that_creep_without_a_laser() -> list[str]:
+    """The stand sinks and the sag seems to shrink by 1 um/s; the gauge alone detects it."""
+    stage = by_optics()
+    stage.wait(60.0)
+
+    def creep() -> str:
+        stage.bench.wrong.camera_offset_um -= TICK_S
+        deep_um = stage.plant.truth().displacement_um
+        return f"the bowl followed the optics to {deep_um:.0f} um" if deep_um > 70.0 else ""
+
+    stage.wait(300.0, creep)
     stage.wait(5.0, stage.still)
     return stage.violations
 
@@ -198,6 +246,8 @@ STORIES: Sequence[Callable[[], list[str]]] = (
     a_creeping_laser,
     a_stuck_gauge_and_a_creeping_laser,
     a_creeping_laser_without_a_camera,
+    a_camera_lost_on_a_bench_without_a_laser,
+    optics_that_creep_without_a_laser,
     a_seam_that_opens,
     a_setpoint_is_reached,
     dead_actuators_are_found,
