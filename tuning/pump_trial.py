@@ -19,6 +19,7 @@ _MAP_S = 3600.0
 # behind a slow ramp an actuator several times as strong as configured does not carry the mirror past the setpoint.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
+_AT_ONCE_S = 1.5  # a round that begins at its limit is over
 _BEFORE_S = 20.0  # whose mean flow about holds the mirror
 _DARK_MOST = 3  # experiments in a row that a lost laser ended
 _CHECK_BEFORE_S, _CHECK_S, _CHECK_AFTER_S = 40.0, 120.0, 15.0
@@ -80,18 +81,21 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     curve = gas.PumpCurve(rig.pump)
     holding = curve.fraction(around.holding_flow_um_per_s)
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
-    while steps := survey.steps():
+    held = True
+    while held and (steps := survey.steps()):
         flow_um_per_s = (
             curve.flow(survey.holding) or around.holding_flow_um_per_s
         )  # none, on a curve far from the true
         around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
-        survey.take(run_of(rows, rig.dt_s), finished.completed)
+        run = run_of(rows, rig.dt_s)
+        survey.take(run, finished.completed)
         if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
-        _returned(rig)
-    return survey.result()
+        # a hold that swings may do; one that stays away ends every round at once
+        held = _returned(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
+    return survey.result(held)
 
 
 def _freed(loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig) -> schema.LoopConfig:
@@ -133,14 +137,14 @@ def _checked(rig: HoldRig) -> tuple[float, float]:
     return gain, sigma
 
 
-def _returned(rig: HoldRig) -> loop_model.Record:
-    """Hold until the mirror is back at the setpoint, or three minutes at most."""
+def _returned(rig: HoldRig) -> bool:
+    """Hold until the mirror is back where it is to stand, at the end of its ramp; not if three minutes are over."""
     for _ in range(_BACK_MOST):
-        record, setpoint_um = rig.hold_about(_BACK_S)
-        off_um = np.abs(record.filled_displacement_um() - setpoint_um).reshape(6, -1).mean(axis=1)
-        if off_um[3:].max() < _BACK_WITHIN_UM:
-            break
-    return record
+        rows = rig.ticks(_BACK_S)
+        off_um = rig.record(rows).filled_displacement_um() - rows[-1].target_um - rows[-1].trim_um
+        if np.abs(off_um).reshape(6, -1).mean(axis=1)[3:].max() < _BACK_WITHIN_UM:
+            return True
+    return False
 
 
 def run_of(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_curve.PumpRun:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.pumps import worst_share
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
@@ -21,7 +23,7 @@ from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreig
 from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
-from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit
+from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
 from tuning.identification.pump_map import PumpMap
 from tuning.identification.pump_survey import PumpSurvey
 from tuning.opening import TwinHold
@@ -85,14 +87,6 @@ def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
     return done.found, link
 
 
-def worst_share(found: PumpMap, pump: ForeignPump) -> float:
-    """Largest error of the flow over the curve, from the start on, as a share of the full flow."""
-    curve = PumpCurve(found.pump)
-    low = max(found.pump.start_fraction, found.pump.curve_fraction[0])
-    commands = np.linspace(low, found.pump.curve_fraction[-1], 100)
-    return max(abs(curve._rising.flow(d) - pump.settled(d)) for d in commands) / pump.full_um_per_s
-
-
 @pytest.mark.campaign
 def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
     """It stopped both the relay's fit ("stalls at small flows") and the former map ("too tight, or no pump")."""
@@ -104,6 +98,14 @@ def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
     held = [row for row in link.rows if row.state in (State.HOLD, State.TUNE)]
     assert max(abs(row.truth_displacement_um) for row in held[2000:]) < 12.0
     assert (tmp_path / "tuning").exists()
+
+
+@pytest.mark.campaign
+def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
+    """The spline carried the certainty of no flow at command 0 into the dead zone: 0.3 um/s where there is none."""
+    pump = ForeignPump("root", 3.1, 0.22, 0.09)
+    found, _ = mapped(tmp_path, ForeignPlant(pump, 20, 2.36, 2.1, laser_um=1.34))
+    assert worst_share(found, pump) < 0.03
 
 
 @pytest.mark.campaign
@@ -189,6 +191,99 @@ def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(leak: float, del
     *_, run, rest = survey._visit(Level(0.6))
     assert (run.fraction, rest.fraction) == (0.6, 0.0)
     assert rest.until_um == pytest.approx(least_um)
+
+
+@pytest.mark.parametrize(
+    ("shape", "share"), [("root", 0.95), ("dead zone", 0.95), ("top unreachable", 0.9), ("quadratic", 0.95)]
+)
+def test_the_smoothed_flows_are_as_wrong_as_they_say(shape: str, share: float) -> None:
+    """All flows share the leak's error, and a dead zone must not be smoothed away with it."""
+    commands = np.array([0.0, 0.015, 0.03, 0.06, 0.09, 0.12, 0.18, 0.25, 0.37, 0.49, 0.6, 0.8, 1.0])
+    true = np.array([ForeignPump(shape, 3.1).settled(d) for d in commands])
+    noise = np.diag([1e-6, *[0.04**2] * 12])
+    noise[1:, 1:] += 0.06**2
+    rng = np.random.default_rng(5)
+    off = []
+    for _ in range(40):
+        flows = true + np.linalg.cholesky(noise) @ rng.standard_normal(true.size)
+        mean, covariance = smoothed(commands, flows, noise)
+        off.append((mean - true)[1:] / np.hypot(np.sqrt(np.diag(covariance))[1:], 0.005))
+    assert np.mean(np.abs(off) < 2) > share
+    assert np.max(np.abs(off)) < 3.6
+
+
+def test_first_pulses_are_longer_after_a_fall_and_shorter_after_a_rise() -> None:
+    def pulses_s(end_um: float, completed: bool) -> list[float]:
+        survey = PumpSurvey(0.5)
+        survey.take(PumpRun(DT_S, *np.array([np.zeros(10), np.linspace(0.0, end_um, 10), np.zeros(10)])), completed)
+        return [step.duration_s for step in survey.steps()[1::3]]
+
+    as_planned = pulses_s(-5.0, completed=True)
+    assert pulses_s(-5.0, completed=False) == pytest.approx([2 * s for s in as_planned])
+    assert pulses_s(+5.0, completed=False) == pytest.approx([s / 2 for s in as_planned])
+
+
+def test_the_levels_with_the_largest_errors_are_visited_first() -> None:
+    survey = survey_of([0.2, 0.4, 0.6, 0.8], [0.5, 1.0, 1.5, 2.0], 0.9)
+    survey._branches[True].sigmas[1:] = [0.05, 0.05, 0.30, 0.06]  # of the smaller ones that of the leak
+    survey._wanted = set(survey.fit.levels)
+    assert [level.fraction for level in survey._visits()[:2]] == [0.6, 0.8]
+
+
+class Standing:
+    """A rig whose mirror follows its setpoint's ramp, or stays where it is."""
+
+    dt_s = 0.1
+
+    def __init__(self, from_um: float, ramp_um_per_s: float) -> None:
+        self.at_um, self.ramp_um_per_s, self.time_s = from_um, ramp_um_per_s, 0.0
+
+    def ticks(self, duration_s: float) -> list[SimpleNamespace]:
+        self.time_s += duration_s
+        rows = []
+        for _ in range(round(duration_s / self.dt_s)):
+            self.at_um = min(0.0, self.at_um + self.ramp_um_per_s * self.dt_s)
+            here_um = 5.0 + 1.5 + self.at_um
+            rows.append(SimpleNamespace(target_um=5.0, trim_um=1.5, setpoint_um=here_um, displacement_um=here_um))
+        return rows
+
+    def record(self, rows: list[SimpleNamespace]) -> SimpleNamespace:
+        return SimpleNamespace(filled_displacement_um=lambda: np.array([row.displacement_um for row in rows]))
+
+
+def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() -> None:
+    back = Standing(-9.0, 0.5)
+    assert pump_trial._returned(back)  # type: ignore[arg-type]
+    assert back.at_um > -2.0
+    assert not pump_trial._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("fractions", "flows", "said"),
+    [([0.03, 0.22], [2.4, 4.8], r"2\.4 um/s already at a command of 0\.03, .* open the bleed"),
+     ([0.23, 0.42], [12.6, 14.8], "did not come back"),
+     ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather")],
+)  # fmt: skip
+def test_a_mirror_that_does_not_come_back_is_told(fractions: list[float], flows: list[float], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        survey_of(fractions, flows, 1.0).result(held=False)
+
+
+@pytest.mark.parametrize(
+    ("white", "worse", "seconds", "said"),
+    [(0.9995, 1.1, 1200.0, "--limit-um 20"), (0.9995, 2.2, 1200.0, "--limit-um 30"),
+     (0.9995, 4.0, 1200.0, "steadier"), (0.9, 1.1, 1200.0, "steadier"), (0.9, 1.1, 20.0, "--limit-um 20")],
+)  # fmt: skip
+def test_a_larger_limit_is_asked_for_only_where_it_would_do(
+    white: float, worse: float, seconds: float, said: str
+) -> None:
+    """In a random walk, or with errors far too large, it would be refused again."""
+    survey = survey_of([0.25, 0.55], [0.1, 17.0], 1.8)
+    survey.fit = replace(survey.fit, share_white=white)
+    survey._branches[True].sigmas[1:] = [0.01, worse * 0.02 * survey.full_um_per_s]
+    survey.runs = [PumpRun(DT_S, *np.zeros((3, round(seconds / DT_S))))]
+    with pytest.raises(ValueError, match=f"not known to 2% .*{said}"):
+        survey.result()
 
 
 def flat_map(pump: PumpConfig) -> PumpMap:

@@ -57,11 +57,11 @@ REFUSALS = {
     "too tight": Refusal(
         ("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1), bleed_fraction=0.005
     ),
-    "flows not known": Refusal(
+    "least flow above the leak": Refusal(
         ("pump",),
-        "run `tune pump` again with --limit-um 20",
-        ("pump", "--limit-um", "20"),
-        lambda: ForeignPlant(ForeignPump("s-shaped", 5.6, 1.33, 0.65), 1032, 0.47, 2.41, True, 1.0),
+        "open the bleed",
+        plant=lambda: ForeignPlant(ForeignPump("bottom unreachable", 25.0, 0.3, 0.3), 5, 0.8, 0.6, laser_um=0.5),
+        bleed_fraction=0.034,
     ),
     "relays stopped by noise": Refusal(
         ("characterise",),
@@ -71,8 +71,8 @@ REFUSALS = {
     ),
     "survey stopped by weather": Refusal(
         ("pump", "--limit-um", "30"),
-        "run `tune pump` again in steadier weather, or with a quieter laser",
-        plant=straight(seed=3, weather=4.0, gusts=True, laser_um=3.0),
+        "in steadier weather",
+        plant=straight(seed=3, weather=8.0, gusts=True, laser_um=3.0),
         then=straight(seed=3),
     ),
 }

@@ -16,7 +16,7 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import FloatArray
 
-_BLOCK_S = 0.1
+BLOCK_S = 0.1
 _BEFORE_S = 8.0  # a flow that was on its way before the first command has arrived by then
 _LEAK_S = 40.0  # between the nodes of the leak's course
 _LEAK_CHANGES_UM_PER_S = 0.2  # what the weather's slow course looks like: 1.5 mK/s of the air
@@ -29,6 +29,9 @@ _OFF_S, _SLOPE_S = 1.0, 0.05  # what delay and lag may be off; for their slopes
 _LEAST_S, _MOST_S = 0.01, 4.0
 _ROUGH = np.geomspace(0.02, 2e4, 8)  # of the curve: square of its second derivative, of the full flow
 _KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
+_AT_ONCE = (0.0, 0.1)  # ... square of the flow with which it starts ...
+_SLOPE = 10.0  # ... and of its slope there
+_CLEAR = 3.0  # standard errors: a flow beyond doubt
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -98,7 +101,7 @@ NO_FIT = PumpFit({}, np.empty((0, 0)), 0.0, 0.0, 0.0, 0.8)
 
 @dataclass(frozen=True, slots=True)
 class _Blocks:
-    """A run in blocks of `_BLOCK_S`: the paths of its levels before the actuator, beginning before the run."""
+    """A run in blocks of `BLOCK_S`: the paths of its levels before the actuator, beginning before the run."""
 
     columns: list[int]  # which of all levels these are
     paths: FloatArray  # (before + n, levels + 1); the last is what flowed before
@@ -212,7 +215,7 @@ def _cost(found: _Flows) -> float:
 
 
 def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
-    size = max(1, round(_BLOCK_S / run.dt_s))
+    size = max(1, round(BLOCK_S / run.dt_s))
     count = run.fraction.size // size
     good = np.isfinite(run.displacement_um)
     if count < 10 or not good.any():
@@ -247,13 +250,13 @@ def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
     """Paths behind the actuator; what flows at the beginning had flowed forever."""
     from scipy.signal import lfilter
 
-    late = delay_s / _BLOCK_S
+    late = delay_s / BLOCK_S
     whole, part = int(late), late - int(late)
     earlier = paths[0] - (paths[1] - paths[0]) * np.arange(whole + 1, 0, -1)[:, None]
     held = np.vstack((earlier, paths))
     rows = paths.shape[0]
     given = (1 - part) * held[1 : rows + 1] + part * held[:rows]
-    keep = math.exp(-_BLOCK_S / lag_s)
+    keep = math.exp(-BLOCK_S / lag_s)
     return np.asarray(lfilter([1 - keep], [1, -keep], given - given[0], axis=0))
 
 
@@ -311,19 +314,23 @@ def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, Floa
 def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that of the flows.
 
-    The average over cubic and linear smoothing splines by their likelihood (Wahba 1978): most curves are smooth, some
-    have kinks.
+    The first is at command 0. The average over curves by their likelihood: nothing up to one of the commands, then
+    perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as most curves are smooth and some
+    have kinks. A spline from command 0 would carry its certainty of no flow into a dead zone.
     """
-    x, full = fractions - fractions[0], max(float(flows.max()), 1e-3)
-    low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
-    bend, line = low**2 * (3 * high - low) / 6, 10.0 * (1 + np.outer(x, x))
+    full = max(float(flows.max()), 1e-3)
     y, noise = flows / full, noise / full**2
+    none = int(np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True)))  # the first certain flow
     found: list[tuple[float, FloatArray, FloatArray]] = []
-    for rough, kinked in product(_ROUGH, _KINKED):
-        free = line + rough * bend + kinked * low
-        weights = np.linalg.solve(free + noise, free).T
-        cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
-        found.append((cost, weights @ y, free - weights @ free))
+    for last in range(max(none, 1)):
+        x = np.maximum(fractions - fractions[last], 0.0)
+        low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
+        bend, jump = low**2 * (3 * high - low) / 6, np.outer(x > 0, x > 0)
+        for rough, kinked, at_once in product(_ROUGH, _KINKED, _AT_ONCE):
+            free = _SLOPE * np.outer(x, x) + rough * bend + kinked * low + at_once * jump
+            weights = np.linalg.solve(free + noise, free).T
+            cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
+            found.append((cost, weights @ y, free - weights @ free))
     costs, means, covariances = (np.array(column) for column in zip(*found, strict=True))
     share = np.exp(-0.5 * (costs - costs.min()))
     share /= share.sum()

@@ -1,5 +1,6 @@
 """The curve that a survey of the pump says, or why there is none to hold a mirror with."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,14 +8,20 @@ import numpy as np
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import Branch, PumpFit
+from tuning.identification.pump_curve import BLOCK_S, Branch, PumpFit
 
 _USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it there is no curve
 _STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
 _REACHES_LEAKS = 1.2
+_FEW_S = 300.0  # of experiments: fewer say nothing of the noise
 _STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
 _NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
 _EDGE_MOST = 0.1  # between the commands of a jump
+_ASTRAY = (
+    "the mirror did not come back to its setpoint within three minutes, with slow gains: the weather is too strong, or "
+    "the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
+    "(loop.bleed_fraction)"
+)
 NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
 
 
@@ -45,6 +52,7 @@ class Surveyed:
     duration_s: float
     done: bool  # every level to the accuracy wanted
     limit_um: float
+    held: bool = True  # the hold brought the mirror back after the last round
 
     def map(self) -> PumpMap:
         """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
@@ -82,11 +90,17 @@ class Surveyed:
             pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
         )  # fmt: skip
 
-    @property
-    def _further(self) -> str:
-        """What makes the flows known better: runs twice as long see twice the way."""
-        limit_um = min(2 * self.limit_um, LIMIT_MAX_UM)
-        if limit_um > self.limit_um:
+    def _further(self, off: float = 2.0) -> str:
+        """What makes the flows known better; the errors are `off` times too large.
+
+        Runs twice as long see a flow in the laser's noise twice as well, in a random walk no better.
+        """
+        walk_shows_s = BLOCK_S / (1 - self.fit.share_white)
+        enough_um = 5.0 * math.ceil(1.3 * off * self.limit_um / 5.0)
+        stopped = self.duration_s < _FEW_S  # the limit ended nearly every run
+        drowned = walk_shows_s * self.fit.leak_um_per_s < self.limit_um
+        if self.limit_um < LIMIT_MAX_UM and (stopped or (not drowned and enough_um <= LIMIT_MAX_UM)):
+            limit_um = min(max(enough_um if not stopped else 0.0, 2 * self.limit_um), LIMIT_MAX_UM)
             return f"run `tune pump` again with --limit-um {limit_um:g}"
         return "run `tune pump` again in steadier weather, or with a quieter laser"
 
@@ -96,7 +110,9 @@ class Surveyed:
         Beyond them nothing is said. Raises ValueError if there are none.
         """
         if not self.fit.levels:
-            raise ValueError(f"the experiments were stopped too early: {self._further}")
+            if not self.held:
+                raise ValueError(_ASTRAY)
+            raise ValueError(f"the experiments were stopped too early: {self._further()}")
         fractions, flows, sigmas = self.rising.columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if stuck(self.fit, self.rising):
@@ -105,6 +121,8 @@ class Surveyed:
                 f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
                 "`tune pump` again"
             )
+        if not self.held:
+            self._refuse_least()
         known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
         low = top = int(np.argmin(np.where(known, np.abs(flows - _REACHES_LEAKS * leak), np.inf)))
         while low > 0 and known[low - 1]:
@@ -115,13 +133,29 @@ class Surveyed:
         if beyond:
             self._refuse_step()
         if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
+            unknown = min(top + 1, known.size - 1) if beyond else low - 1
+            where = f"{'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f}"
             raise ValueError(
-                f"the flow {'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f} is "
-                f"not known to {_USEFUL_SHARE:.0%} after {self.duration_s / 60:.0f} minutes of experiments: "
-                f"{self._further}"
+                f"the flow {where if top else 'at every command'} is not known to {_USEFUL_SHARE:.0%} after "
+                f"{self.duration_s / 60:.0f} minutes of experiments: "
+                f"{self._further(float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s))}"
             )
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
+
+    def _refuse_least(self) -> None:
+        """Raises ValueError as the mirror is not brought back, with the least flow if that is the reason."""
+        fractions, flows, sigmas = self.rising.columns
+        leak = self.fit.leak_um_per_s
+        first = int(np.argmax(flows - 2 * sigmas > leak))
+        none = (flows[:first] + 2 * sigmas[:first] < _NONE_SHARE * self.full_um_per_s).all()
+        if first and none and fractions[first] - fractions[first - 1] <= _STEP_MOST:
+            raise ValueError(
+                f"the hold does not bring the mirror back: the pump gives {flows[first]:.1f} um/s already at a "
+                f"command of {fractions[first]:.2f}, and the mirror loses {leak:.1f} um/s: "
+                "throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
+            )
+        raise ValueError(_ASTRAY)
 
     def _refuse_step(self) -> None:
         """Raises ValueError if the flow rises at once from less than the leak to several times as much."""

@@ -53,6 +53,7 @@ class PumpSurvey:
     fit: PumpFit = NO_FIT
     dark: int = 0  # the latest runs that ended without a reading
     _share: float = 1.0  # of the travel, smaller after a run that was stopped
+    _longer: float = 1.0  # the first pulses, while no flow is known
     _rounds: int = 0
     _wanted: set[Level] = field(default_factory=set)
     _branches: dict[bool, Branch] = field(default_factory=dict)
@@ -65,7 +66,10 @@ class PumpSurvey:
     def take(self, run: PumpRun, completed: bool) -> None:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
-        self._share = min(1.0, self._share * (1.2 if completed else 0.8))
+        if self._sure()[1].any():
+            self._share = min(1.0, self._share * (1.2 if completed else 0.8))
+        elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
+            self._longer *= 2.0 if _sank(run) else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
         self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
@@ -85,7 +89,7 @@ class PumpSurvey:
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
             rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
             pulses = [
-                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s * self._share, rise_um), _for(0.0, 0.5))
+                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s * self._longer, rise_um), _for(0.0, 0.5))
                 for longest_s in _FIRST_PULSES_S
             ]
             return tuple(step for pulse in pulses for step in pulse)
@@ -135,12 +139,7 @@ class PumpSurvey:
         noise = np.zeros((fractions.size,) * 2)
         noise[0, 0] = _NONE_UM_PER_S**2
         noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
-        weights = 1 / np.diag(noise)
-        rising_flows = np.asarray(isotonic_regression(flows, weights=weights).x)
-        jump = first_jump(Branch(fractions, rising_flows, weights**-0.5), self.full_um_per_s)
-        first = int(np.searchsorted(fractions, jump[1])) if jump is not None else 0
-        flows[:first] = rising_flows[:first]
-        flows[first:], noise[first:, first:] = smoothed(fractions[first:], flows[first:], noise[first:, first:])
+        flows, noise = smoothed(fractions, flows, noise)
         sigmas = np.sqrt(np.maximum(np.diag(noise), 0.0))
         return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
@@ -211,13 +210,18 @@ class PumpSurvey:
         return [f for f in found if f > 0]
 
     def _visits(self) -> list[Level]:
-        """Levels to visit in the next round: new ones once, small ones first, or others as often as they ask for."""
+        """Levels to visit in the next round: new ones once, small ones first, then others as often as they ask for.
+
+        A round reaches only the first of them. Where the leak's error keeps every level from being known, those with
+        the largest error of their own must be among them.
+        """
         wanted = sorted(level for level in self._wanted if self._reachable(level))
         fresh = [level for level in wanted if level not in self.fit.levels]
         wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
-        asked = [3 * (self.sigma(level) / wide) ** 2 if level not in fresh else 0.0 for level in wanted]
+        worst = sorted((level for level in wanted if level not in fresh), key=self.sigma, reverse=True)
+        asked = [3 * (self.sigma(level) / wide) ** 2 for level in worst]
         again = [
-            level for turn in range(_MOST_VISITS) for level, n in zip(wanted, asked, strict=True) if n > max(turn, 3)
+            level for turn in range(_MOST_VISITS) for level, n in zip(worst, asked, strict=True) if n > max(turn, 3)
         ]
         return fresh + again
 
@@ -285,15 +289,15 @@ class PumpSurvey:
         """A larger command, from which a level is reached: beyond any hysteresis."""
         return min(1.0, level.fraction + _ABOVE)
 
-    def result(self) -> PumpMap:
-        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
-        return self._surveyed().map()
+    def result(self, held: bool = True) -> PumpMap:
+        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with.
 
-    def _surveyed(self) -> Surveyed:
+        `held`: the hold brought the mirror back after the last round.
+        """
         return Surveyed(
             self.fit, self._branches.get(True, NO_BRANCH), self._branches.get(False, NO_BRANCH), self.full_um_per_s,
-            bool(self._branches) and self.hysteretic(), self.duration_s, self.done, self.limit_um,
-        )  # fmt: skip
+            bool(self._branches) and self.hysteretic(), self.duration_s, self.done, self.limit_um, held,
+        ).map()  # fmt: skip
 
     def _up(self) -> float:
         """The smallest known command that lifts the mirror well; the largest if none does."""
@@ -312,6 +316,12 @@ def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
     before, after = np.append(0.0, slopes[:-1]) - slopes, np.append(slopes[1:], 0.0) - slopes
     across = np.where(before * after < 0, before * after, 0.0)
     return np.abs(across * widths / np.where(across, before - after, 1.0))
+
+
+def _sank(run: PumpRun) -> bool:
+    """Whether the mirror was below where it began at the end of a run."""
+    read_um = run.displacement_um[np.isfinite(run.displacement_um)]
+    return bool(read_um.size and read_um[-1] < read_um[0])
 
 
 def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:
