@@ -6,6 +6,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,8 @@ def for_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
                 f"{where}: loop.{key} = {getattr(running, key):g}, {folder.path.name} began with "
                 f"{getattr(known[0], key):g}: set that with `ctl gains`, or start a new session with another --name"
             )
-    return folder
+    bleed = {"bleed_fraction": running.bleed_fraction}  # perhaps opened since, as a refusal asked
+    return replace(folder, head=replace(folder.head, before=folder.head.before.model_copy(update=bleed)))
 
 
 # Kept gains into the configuration, so that the next hold starts with them.

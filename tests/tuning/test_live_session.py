@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,7 +152,9 @@ def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
     config = config.model_copy(update={"pump": config.pump.model_copy(update=pump)})
     link = SimpleNamespace(config=config, name="a-later-run")
     if not refused:
-        assert choice.for_hold(opened, link) is opened  # type: ignore[arg-type]
+        going_on = choice.for_hold(opened, link)  # type: ignore[arg-type]
+        bleed = {"bleed_fraction": running.bleed_fraction}  # what a refusal may have asked for
+        assert going_on == replace(opened, head=replace(opened.head, before=RUNNING.model_copy(update=bleed)))
         return
     with pytest.raises(InputError, match=refused):
         choice.for_hold(opened, link)  # type: ignore[arg-type]

@@ -19,7 +19,7 @@ from membrane_ctrl.model.arrays import FloatArray
 BLOCK_S = 0.1
 _BEFORE_S = 8.0  # a flow that was on its way before the first command has arrived by then
 _LEAK_S = 40.0  # between the nodes of the leak's course
-_LEAK_CHANGES_UM_PER_S = 0.2  # what the weather's slow course looks like: 1.5 mK/s of the air
+_LEAK_CHANGES_UM_PER_S = (0.02, 0.06, 0.2)  # the weather's slow course looks like it; the last is 1.5 mK/s of the air
 _BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
 _WHITES = (0.9, 0.97, 0.99, 0.997, 0.9995)
 _DELAYS_S, _LAGS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2), (0.1, 0.4, 1.0, 2.0)
@@ -84,11 +84,12 @@ class PumpFit:
     delay_s: float
     lag_s: float
     share_white: float  # of the noise: 1 - 1/(blocks that the random walk takes to show)
+    leak_changes_um_per_s: float = _LEAK_CHANGES_UM_PER_S[-1]  # its standard deviation within a run
 
     @property
-    def actuator(self) -> tuple[float, float]:
-        """Delay and lag in s."""
-        return self.delay_s, self.lag_s
+    def likeliest(self) -> tuple[float, float, float, float]:
+        """Delay, lag, noise, changes of the leak."""
+        return self.delay_s, self.lag_s, self.share_white, self.leak_changes_um_per_s
 
     @property
     def answer_s(self) -> float:
@@ -117,9 +118,14 @@ class _Flows:
     delay_s: float
     lag_s: float
     white: float
+    leak_changes_um_per_s: float
     cost: float  # twice the negative log likelihood
     values: FloatArray
     covariance: FloatArray
+
+    def near(self, white: float, leak_changes_um_per_s: float) -> bool:
+        """Whether at most one of the two differs."""
+        return white == self.white or leak_changes_um_per_s == self.leak_changes_um_per_s
 
 
 def levels_of(run: PumpRun) -> list[Level | None]:
@@ -141,10 +147,12 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
     """
     levels = sorted({level for run in runs for level in levels_of(run) if level is not None})
     model = _Mirror([_blocks(run, levels) for run in runs], len(levels))
-    starts = product(_DELAYS_S, _LAGS_S, _WHITES[1:2]) if near is None else ((*near.actuator, near.share_white),)
-    best = min((model.solved(*start) for start in starts), key=_cost)
+    starts = product(_DELAYS_S, _LAGS_S, _WHITES[1:2], _LEAK_CHANGES_UM_PER_S[-1:])
+    best = min((model.solved(*start) for start in (starts if near is None else (near.likeliest,))), key=_cost)
     for _ in range(_TURNS):
-        better = min((model.improved(best), *(model.solved(best.delay_s, best.lag_s, w) for w in _WHITES)), key=_cost)
+        noises = product(_WHITES, _LEAK_CHANGES_UM_PER_S)
+        tried = (model.solved(best.delay_s, best.lag_s, *noise) for noise in noises if best.near(*noise))
+        better = min((model.improved(best), *tried), key=_cost)
         enough = best.cost - better.cost < _ENOUGH
         best = better
         if enough:
@@ -166,46 +174,52 @@ class _Mirror:
         self._noise_um = float(np.median(np.abs(bends))) / 0.6745 / math.sqrt(6)
         self._rows = sum(block.displacement_um.size for block in blocks)
 
-    def solved(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None = None) -> _Flows:
+    def solved(
+        self, delay_s: float, lag_s: float, white: float, changes: float, flows: FloatArray | None = None
+    ) -> _Flows:
         """Flows behind an actuator; with `flows` also how far delay and lag are off, if those flowed."""
-        gram, cost = self._gram(delay_s, lag_s, white, flows)
+        gram, cost = self._gram((delay_s, lag_s, white), changes, flows)
         here = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
         variance, values, covariance = _least_squares(here, self._rows)
         cost += self._rows * math.log(variance)
         if flows is not None:
             gram[_OFF, _OFF] += self._noise_um**2 / _OFF_S**2
             _, values, covariance = _least_squares(gram, self._rows)
-        return _Flows(delay_s, lag_s, white, cost, values, covariance)
+        return _Flows(delay_s, lag_s, white, changes, cost, values, covariance)
 
     def improved(self, best: _Flows) -> _Flows:
         """With a better delay and lag, if there are any."""
-        off = self.solved(best.delay_s, best.lag_s, best.white, best.values).values[-2:]
+        kept = best.white, best.leak_changes_um_per_s
+        off = self.solved(best.delay_s, best.lag_s, *kept, best.values).values[-2:]
         for share in (1.0, 0.4, 0.1):
             delay_s, lag_s = np.clip((best.delay_s, best.lag_s) + share * off, _LEAST_S, _MOST_S).tolist()
-            found = self.solved(delay_s, lag_s, best.white)
+            found = self.solved(delay_s, lag_s, *kept)
             if found.cost < best.cost:
                 return found
         return best
 
     def fitted(self, best: _Flows, levels: Sequence[Level]) -> PumpFit:
         """The flows of the levels, with the share of delay and lag in their errors."""
-        found = self.solved(best.delay_s, best.lag_s, best.white, best.values)
+        kept = best.white, best.leak_changes_um_per_s
+        found = self.solved(best.delay_s, best.lag_s, *kept, best.values)
         count = len(levels)
         covariance = found.covariance[:count, :count]
         columns = found.values[:count].tolist(), np.sqrt(np.diag(covariance)).tolist()
         flows = {level: FlowAt(*at) for level, *at in zip(levels, *columns, strict=True)}
-        return PumpFit(flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, best.white)
+        return PumpFit(flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, *kept)
 
-    def _gram(self, delay_s: float, lag_s: float, white: float, flows: FloatArray | None) -> tuple[FloatArray, float]:
+    def _gram(
+        self, at: tuple[float, float, float], changes: float, flows: FloatArray | None
+    ) -> tuple[FloatArray, float]:
         """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's determinant."""
         last = self._levels + np.arange(5)
         whole, determinant = np.zeros((self._levels + 5,) * 2), 0.0
         for block in self._blocks:
             given = np.zeros(len(block.columns) + 1) if flows is None else flows[[*block.columns, self._levels]]
-            columns = _whitened(block, (delay_s, lag_s, white), given, self._has_pressure)
-            gram, logarithm = _without_own(columns, block.leak.shape[1], white, self._noise_um)
-            at = np.append(block.columns, last).astype(int)
-            whole[np.ix_(at, at)] += gram
+            columns = _whitened(block, at, given, self._has_pressure)
+            gram, logarithm = _without_own(columns, block.leak.shape[1], at[2], (self._noise_um, changes))
+            where = np.append(block.columns, last).astype(int)
+            whole[np.ix_(where, where)] += gram
             determinant += logarithm
         return whole, determinant
 
@@ -284,11 +298,13 @@ def _whitened(block: _Blocks, at: tuple[float, float, float], flows: FloatArray,
     return np.asarray(lfilter([1.0], [1.0, -white], np.diff(columns, axis=0), axis=0))
 
 
-def _without_own(columns: FloatArray, nodes: int, white: float, noise_um: float) -> tuple[FloatArray, float]:
+def _without_own(
+    columns: FloatArray, nodes: int, white: float, noises: tuple[float, float]
+) -> tuple[FloatArray, float]:
     """Products of a run's columns levels, leak, pressure, delay, lag, height, after what belongs to this run alone.
 
     These are the course of the leak, what the pump gave before the run, and the noise of the first reading. Also the
-    logarithm of their determinant.
+    logarithm of their determinant. Noises: of a reading in um, of the leak in um/s.
     """
     paths, leak, rest = np.split(columns, (-4 - nodes, -4), axis=1)
     levels, before = paths[:, :-1], paths[:, -1:]
@@ -296,10 +312,12 @@ def _without_own(columns: FloatArray, nodes: int, white: float, noise_um: float)
     shared = np.hstack((levels, before - leak.sum(axis=1, keepdims=True), rest))
     first = white ** np.arange(1, before.size + 1)[:, None]
     own = np.hstack((leak, before, first))
-    spread = np.array([*[_LEAK_CHANGES_UM_PER_S] * nodes, _BEFORE_UM_PER_S, noise_um])
-    across, inner = own.T @ shared, own.T @ own + np.diag((noise_um / spread) ** 2)
+    noise_um, leak_um_per_s = noises
+    spread = np.array([*[leak_um_per_s] * nodes, _BEFORE_UM_PER_S, noise_um])
+    free = (noise_um / spread) ** 2
+    across, inner = own.T @ shared, own.T @ own + np.diag(free)
     gram = shared.T @ shared - across.T @ np.linalg.solve(inner, across)
-    return np.asarray(gram), float(np.linalg.slogdet(inner)[1])
+    return np.asarray(gram), float(np.linalg.slogdet(inner)[1] - np.log(free).sum())
 
 
 def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray]:

@@ -18,8 +18,8 @@ _STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mi
 _NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
 _EDGE_MOST = 0.1  # between the commands of a jump
 _ASTRAY = (
-    "the mirror did not come back to its setpoint within three minutes, with slow gains: the weather is too strong, or "
-    "the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
+    "the mirror did not come back to its setpoint within three minutes, with slow gains: the weather is too strong, "
+    "or the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
     "(loop.bleed_fraction)"
 )
 NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
