@@ -17,7 +17,7 @@ from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, Pum
 from tuning.identification.pump_map import JUMP_SHARE, NO_BRANCH, PumpMap, Surveyed, first_jump, stuck
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
-_BENT_SHARE = 0.035  # of the full flow, by which a kink between two levels may be hidden
+_BENT_SHARE = 0.025  # of the full flow, by which a kink between two levels may be hidden
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
