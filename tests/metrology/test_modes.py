@@ -27,6 +27,19 @@ def test_lines_beyond_half_the_frame_rate_are_named(seed: int) -> None:
         assert seen.aliases_hz == ()
 
 
+@pytest.mark.parametrize("seed", [302, 309])
+def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
+    """At one of the rates it may have the alias of drift; what it leaves there is not nothing."""
+    time_s, coeffs_um, planted = watched(seed, rates_hz=(15, 15 / 1.09, 15 / 1.17), noise_nm=6.0)
+    sure = [line for line in find_modes(time_s, coeffs_um) if not line.aliases_hz]
+    assert len(sure) >= 3
+    assert all(any(abs(line.frequency_hz - mode.frequency_hz) < 0.1 for mode in planted) for line in sure)
+
+
+def test_a_hold_does_not_tell_of_a_line_that_may_be_another() -> None:
+    assert Stethoscope().search(*watched(4, lines_hz=(48.0,), rates_hz=(20.0,))[:2]) == []
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_and_drift_are_no_line(seed: int) -> None:
     assert find_modes(*watched(seed, lines_hz=())[:2]) == ()

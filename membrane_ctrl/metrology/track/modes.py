@@ -36,6 +36,7 @@ _GAP = 4.5  # intervals: as long a pause ends a piece
 _MOST = 24
 _CHANCE = 1e-9  # of a false line in one search
 _ALIKE = 10.0  # difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
+_LEAKED = 0.1  # of T: what a line leaves where its alias is as slow as drift, and another frequency takes for itself
 _MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
 _APART_HZ = 0.3  # closer ones are one line
 _SAME = 0.004  # relative: two searches see one mode, whatever the shapes
@@ -210,18 +211,18 @@ def _threshold(seen: FloatArray, frequencies: int) -> float:
 def _likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
     """The frequency with the largest T, and others that explain the frames as well.
 
-    Of equal ones it is the one that all its pieces show, then the lowest: an alias may be missing from pieces that
-    would show it, where the true frequency has the alias of drift.
+    Of equal ones it is the one that all its pieces show, then the lowest.
     """
     best = int(np.argmax(seen))
-    inner = seen[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= seen[:-2]) & (inner > seen[2:]) & (inner > seen[best] - _ALIKE))
+    inner, near = seen[1:-1], seen[best] - max(_ALIKE, _LEAKED * seen[best])
+    peaks = 1 + np.flatnonzero((inner >= seen[:-2]) & (inner > seen[2:]) & (inner > near))
     apart = round(_APART_HZ * _GRID * PIECE_S)
     alike = [best, *(int(k) for k in peaks if abs(k - best) > apart)]
     each = {k: seen[k] / visible[k] for k in alike}
     alike = [k for k in alike if each[k] > _MISSING * max(each.values())]
-    equal = [k for k in alike if seen[k] > max(seen[j] for j in alike) - 0.1]
-    return min(equal), sorted(set(alike) - {min(equal)})
+    most = max(seen[k] for k in alike)
+    likeliest = min(k for k in alike if seen[k] > most - 0.1)
+    return likeliest, sorted(k for k in alike if k != likeliest and seen[k] > most - _ALIKE)
 
 
 def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
@@ -279,9 +280,9 @@ class Stethoscope:
         return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
 
     def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
-        """Search a minute of terms (n, 36) at times (n,)."""
+        """Search a minute of terms (n, 36) at times (n,); a line of several possible frequencies is not told."""
         try:
-            found = find_modes(time_s, terms_um)
+            found = [line for line in find_modes(time_s, terms_um) if not line.aliases_hz]
         except ValueError:  # too many gaps
             return []
         for mode in self._modes:
