@@ -46,7 +46,8 @@ class _Jumps:
         return False
 
 
-_FIGURE_S, _FIGURES = 0.5, 3  # a figure older than this, and than so many intervals, shows nothing
+_FIGURE_S, _FIGURES = 1.0, 5  # a figure older than this, and than so many intervals, shows nothing
+_JUMPED = 5  # figures in a row that no film can show; one or two are bad figures
 _REPEATS = 3  # no two figures have the same noise
 _CAMERA_STARTS_S = 900.0  # compiling on a slow machine, and the self-test of screen and camera
 
@@ -77,7 +78,7 @@ class _Figures:
             self._take(figure, now_s)
         age_s = now_s - self._time_s
         self.missing = ""
-        if age_s <= self._fresh_s and self._repeats < _REPEATS:
+        if age_s <= self._fresh_s and self._repeats < _REPEATS and self._jumps.count < _JUMPED:
             return self._um
         if self._repeats >= _REPEATS:
             self.missing = "the camera repeats one figure to the last bit"

@@ -214,7 +214,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=11, name="film_unseen", cause="no figure of the film on a bench held without a laser",
-        limit="0.5 s, or 3 frames", safe_level=SafeLevel.HOLD_FLOW, may_resume=True,
+        limit="1 s, or 5 frames", safe_level=SafeLevel.HOLD_FLOW, may_resume=True,
         remedy="look at camera and screen; nothing else sees the film well enough to hold it",
         seen=lambda o: o.unseen_film, broken=lambda o, c: bool(o.unseen_film),
     ),
