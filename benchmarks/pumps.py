@@ -1,7 +1,7 @@
 """Pumps drawn at random in the second world, each surveyed: a curve or a refusal, its error, the excursion.
 
 `python -m benchmarks.pumps --pumps 40` prints a line for each and the table of docs/tuning.md; 5 s of CPU for each.
-`--first 28 --pumps 1` looks at one.
+`--first 28 --pumps 1` looks at one, `--shape root --full-um-per-s 3.1 --leak-um-per-s 2.1` at pumps of a kind.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from unittest.mock import patch
 
 import numpy as np
@@ -186,10 +186,17 @@ def main() -> None:
     parser.add_argument("--pumps", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--limit-um", type=float, default=10.0)
+    parser.add_argument("--shape", choices=sorted(second_world.CURVES), help="of all, instead of any")
+    parser.add_argument("--full-um-per-s", type=float, help="likewise")
+    parser.add_argument("--leak-um-per-s", type=float, help="likewise")
     given = parser.parse_args()
+    alike = {name: getattr(given, name) for name in ("shape", "full_um_per_s", "leak_um_per_s")}
+    alike = {name: value for name, value in alike.items() if value is not None}
+    if "shape" in alike:  # the others are those of the shape drawn
+        alike |= {"start": 0.0, "stall": 0.0, "play": 0.02 if given.shape == "hysteretic" else 0.0}
     rows: list[SurveyedPump] = []
     for seed in range(given.first, given.first + given.pumps):
-        rows.append(surveyed(drawn(seed), given.limit_um))
+        rows.append(surveyed(replace(drawn(seed), **alike), given.limit_um))
         row = rows[-1]
         print(
             f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest {row.excursion_um:.1f} um, "

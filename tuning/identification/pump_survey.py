@@ -26,7 +26,7 @@ _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _CAUGHT = 0.75  # of the limit; the rest is for gusts and noise
 _NONE_UM_PER_S = 1e-3  # at command 0
-_PULSE_S, _LONGEST_S = 0.2, 20.0
+_SHORTEST_S, _PULSE_S, _LONGEST_S = 0.05, 0.2, 20.0
 _MOST_VISITS = 6
 _ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
@@ -89,8 +89,8 @@ class PumpSurvey:
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
             rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
             pulses = [
-                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s * self._longer, rise_um), _for(0.0, 0.5))
-                for longest_s in _FIRST_PULSES_S
+                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s, rise_um), _for(0.0, 0.5))
+                for longest_s in np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S).tolist()
             ]
             return tuple(step for pulse in pulses for step in pulse)
         self._want()
