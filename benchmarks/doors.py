@@ -154,8 +154,10 @@ def _ca(tell: Told, ports: dict[str, int]) -> None:
     _sweeps(tell, lambda: [pv.read(timeout=2.0, data_type="time").metadata.timestamp for pv in pvs])
 
 
-def _pva(tell: Told, ports: dict[str, int]) -> None:
-    os.environ.update(EPICS_PVA_NAME_SERVERS=f"127.0.0.1:{ports['pva']}", EPICS_PVA_AUTO_ADDR_LIST="NO")
+def _pva(tell: Told, _: dict[str, int]) -> None:
+    # as in a lab; through a TCP name server it would look again every 10 s only (benchmarks/epics_return.py)
+    os.environ.setdefault("EPICS_PVA_ADDR_LIST", "127.0.0.1")
+    os.environ["EPICS_PVA_AUTO_ADDR_LIST"] = "NO"
     from p4p.client.thread import Context
 
     context, names = Context("pva"), [f"mirror:{name}" for name in NAMES]

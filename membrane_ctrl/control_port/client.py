@@ -54,7 +54,7 @@ class PortClient:
             connection.settimeout(_ANSWER_S)
         except (FileNotFoundError, ConnectionRefusedError):
             connection.close()
-            raise DeviceError(f"{path}: no hold is listening; name its run with --run or --socket") from None
+            raise DeviceError(f"{path}: no hold is listening") from None
         except BlockingIOError:
             connection.close()
             raise DeviceError(f"{path}: too many connections are waiting; try again") from None

@@ -190,7 +190,10 @@ def connected(where: Where, notice: Callable[[str], None] = _printed) -> PortCli
     """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no hold answers."""
     if where.tls:
         return _connect_tls(where, notice)
-    client = PortClient.unix(socket_path(where), notice)
+    path = socket_path(where)
+    if where.socket is None and where.run is None and not path.exists():
+        raise errors.DeviceError(f"{path}: no hold is listening; name its run with --run or --socket")
+    client = PortClient.unix(path, notice)
     if where.run is not None and client.greeting["run"] != where.run.resolve().name:
         client.close()
         raise errors.InputError(f"{where.run}: is not running; {client.greeting['run']} is")

@@ -366,11 +366,12 @@ async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) ->
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     part = (sys.executable, "-m", "benchmarks.doors", str(tmp_path), "--part", kind, "--ports", json.dumps(ports))
     seen, settings = tmp_path / f"{kind}.jsonl", SERVERS.format(**ports)
+    env = {"EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{ports['pva']}", "EPICS_PVA_ADDR_LIST": ""}  # this door, no other
     async with held(tmp_path), AsyncExitStack() as stack:
         async with doors(tmp_path, settings) as door:
-            async with program(*part):  # killed at the end
+            async with program(*part, **env):  # killed at the end
                 await fresh(seen, time.time())
-            client = await stack.enter_async_context(program(*part))
+            client = await stack.enter_async_context(program(*part, **env))
             await fresh(seen, time.time())
             door.kill()
             await door.wait()

@@ -150,20 +150,21 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
 def fleet_picture(folder: Path) -> dict[str, bytes]:
     """The page of six holds, one of which has ended."""
     names = ["north", "south", "east", "west", "spare", "bench"]
-    with slowed_holds(folder, 3.0, names) as holds:
+    with slowed_holds(folder, 8.0, names) as holds:
         return {"web-fleet": asyncio.run(_fleet_picture(folder, names, holds))}
 
 
 async def _fleet_picture(folder: Path, names: list[str], holds: subprocess.Popen[str]) -> bytes:
     options = ("--fleet", str(fleet_file(folder, *names)))
     async with served(folder, *options) as link, browser_tab(link, folder / "profile") as tab:
-        await asyncio.sleep(120.0)
+        await asyncio.sleep(220.0)
         await asyncio.to_thread(command, "ctl", "manual", 1.2, "--socket", folder / "east" / "control.sock")
+        await tab.show_as(1500, 1000, dark=True)
+        await asyncio.sleep(20.0)
         assert holds.stdin is not None
         holds.stdin.write("end spare\n")
         holds.stdin.flush()
-        await tab.show_as(1500, 1000, dark=True)
-        await asyncio.sleep(20.0)
+        await tab.until("document.body.innerText.includes('the run has ended')")
         await tab.screenshot(folder / "fleet.png", whole=False)
     return await asyncio.to_thread((folder / "fleet.png").read_bytes)
 

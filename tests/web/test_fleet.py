@@ -41,6 +41,7 @@ async def test_the_terminal_lists_all_holds(tmp_path: Path, capsys: pytest.Captu
         assert faulty.split()[:2] == ["south", "fault"]
         assert spare.startswith("spare  no contact")
         assert "no hold is listening" in spare
+        assert "--socket" not in spare, "the fleet file names it"
         assert "0.250" not in spare
         assert await asyncio.to_thread(command, ["ctl", "fleet", str(file), "--json"]) == Exit.DEVICE_FAILED
         found = json.loads(capsys.readouterr().out)
