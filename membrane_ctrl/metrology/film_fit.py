@@ -4,9 +4,9 @@ Each figure gives four rotationally symmetric numbers: Noll 4, 11, 22 and the ex
 them from the pre-strain, the Poisson ratio and the set's own load q; the gauge says q = p a / (E t). Terms with
 azimuthal order 1 to 3 belong to the ring: a pre-strain that varies, a ring that is not flat or not round.
 
-No film obeys a law exactly. Its misfit is a random figure, nearly the same in all sets, of unknown size; the size
-is taken from what the law leaves, here and in the terms that it says nothing about, and all results are averaged
-over the sizes that the figures allow. So a wrong law widens the error bars instead of moving the numbers.
+No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows with a power of the
+sag; both are taken from what the law leaves, here and in the terms that it says nothing about, and all results are
+averaged over what the figures allow. So a wrong law widens the error bars instead of moving the numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +26,14 @@ PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
 _RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "round": 2.0}  # mm
 _ROUND = np.array([2, 9, 20, 35])  # of a figure's 36 parameters: Noll 4, 11, 22, excess
 _FREEDOM = np.array([1.0, 1.0, 1.0, 0.1])  # of a misfit: the excess has a tenth of a term's
-_DIFFERS = 0.1  # of the misfit that differs between the sets, the part that does not follow the sag
+# Of the misfit that differs between the sets: what does not follow the sag, and what does but is another figure
+_DIFFERS, _UNRELATED = 0.1, 0.5
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
 _TIMES_SEEN = np.logspace(0, 2.5, 12)  # sizes of the common misfit: never below that of the terms without a law
-_GROWTHS = np.array([0.5, 1.0, 2.0, 4.0, 8.0])  # powers of the sag with which a misfit grows
-# What the law neglects (pressure normal to the film, slopes squared), of sag^3 / radius^2: 1 um at 37 mm
-_NEGLECTED = 0.005
-# by which the law's misfit is unlike that of the terms without a law: natural logarithm, of a Cauchy distribution
-_UNLIKE = 1.0
+# Powers of the sag with which a misfit grows: a ring's figure stays, what a law leaves of large strains grows by 3
+_GROWTHS = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0])
+_NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 um at 37 mm
+_UNLIKE = 1.0  # misfit over that of the terms without a law: natural logarithm, of a Cauchy distribution
 _SURE = 4.0  # sigmas
 _NODES = _ITERATIONS = 40
 
@@ -103,7 +103,7 @@ def fit_film(figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float
     law = FilmLaw(float(unknowns[0]), float(unknowns[1]), float(np.exp(unknowns[2])), radius_mm)
     bowls = law.loaded(np.exp(unknowns[3:, None]))
     waves, predicted = _fit_ring(figures, bowls, reach, seen_mm)
-    predicted[:, _ROUND] = round_terms_mm(bowls, reach)
+    predicted[:, _ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
     known = np.zeros(TERMS, bool)
     known[_ROUND] = True
     for order in (1, 2, 3):
@@ -123,6 +123,13 @@ def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
     """Noll 4, 11, 22 and the excess, (n, 4), that a fit of slopes inside `reach` radii finds in bowls (n, 1)."""
     rho, weight, onto = _round_projection(reach)
     return np.asarray(bowls.rise_mm(rho) * weight @ onto.T)
+
+
+def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
+    """What finite slopes add to `round_terms_mm`: a hundredth, which hardly changes with the law's numbers."""
+    rho, weight, onto = _round_projection(reach)
+    rises = [film_law.finite_rise_mm(law, float(load), rho) for load in bowls.load.ravel()]
+    return np.asarray((rises - bowls.rise_mm(rho)) * weight @ onto.T)
 
 
 @cache
@@ -151,38 +158,40 @@ def _fit_round(
     sag_mm = float(np.mean([each.sag_mm for each in figures]))
     seen_mm = max(seen_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
     gauged = np.isfinite(pressure)
-    log_q = np.log(np.where(gauged, pressure, 1.0) * radius_mm * 1e-3)[gauged]
+    log_q = np.log(pressure[gauged] * radius_mm * 1e-3)
     data = np.array([each.parameters_mm[_ROUND] for each in figures]).ravel()
+    finite = np.zeros((count, len(_ROUND)))
+
+    def bent(x: FloatArray) -> tuple[FilmLaw, Bowl]:
+        law = FilmLaw(float(x[0]), float(x[1]), 1.0, radius_mm)
+        return law, law.loaded(np.exp(x[3:, None]))
 
     def predict(x: FloatArray) -> FloatArray:
-        bowls = FilmLaw(float(x[0]), float(x[1]), 1.0, radius_mm).loaded(np.exp(x[3:, None]))
-        return np.append(round_terms_mm(bowls, reach).ravel(), x[3:][gauged] + x[2])
+        return np.append((round_terms_mm(bent(x)[1], reach) + finite).ravel(), x[3:][gauged] + x[2])
 
-    relative = gauge.offset_pa / pressure[gauged]
-    of_gauge = np.outer(relative, relative) + gauge.scale**2 + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
+    offset = gauge.offset_pa / pressure[gauged]
+    of_gauge = np.outer(offset, offset) + gauge.scale**2 + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
     shared = _shared(figures, _ROUND)
     noise = np.zeros((len(data) + len(log_q),) * 2)
     noise[: len(data), : len(data)], noise[len(data) :, len(data) :] = shared, of_gauge
-    misfits = np.zeros((2, *noise.shape))
+    misfits = np.zeros((_GROWTHS.size, *noise.shape))
     misfits[:, : len(data), : len(data)] = [np.kron(part, np.diag(_FREEDOM**2)) for part in _alike(figures)]
     known = np.append([0.0, POISSON, 12.0], np.zeros(count))
     precision = np.append([PRESTRAIN_SIGMA**-2, POISSON_SIGMA**-2, 1e-4], np.full(count, 1e-6))
     start = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(np.array([each.sag_mm for each in figures]))
     x = np.append([0.0, POISSON, 12.0], np.log(start.load))
-    if gauged.any():
-        x[2] = float(np.mean(log_q - x[3:][gauged]))
-    target, spread = np.append(data, log_q), _relative_spread(figures)
+    x[2], target = float(np.mean(log_q - x[3:][gauged])) if gauged.any() else x[2], np.append(data, log_q)
+    far = True
     for _ in range(_ITERATIONS):
+        finite[:] = _finite_terms_mm(*bent(x), reach)
         slopes, rest = _slopes(predict, x), target - predict(x)
-        tried = _solved(slopes, rest, noise + seen_mm**2 * sum(misfits), known - x, precision)
+        tried = _averaged(slopes, rest, noise, misfits[-far:], known - x, precision, seen_mm)  # far: one will do
         step = tried.mean * _inside(x, tried.mean)
         x = x + step
-        if np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3])):
-            allowed = _averaged(
-                _slopes(predict, x), target - predict(x), noise, misfits, known - x, precision, seen_mm, spread
-            )
-            x = x + allowed.mean * _inside(x, allowed.mean)
-            return x, allowed.covariance[:3, :3], allowed.size_mm
+        near = np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3]))
+        if near and not far:
+            return x, tried.covariance[:3, :3], tried.size_mm
+        far = far and not near
     raise ValueError("no film of the law is like these figures: they are of different films, or of a wrong geometry")
 
 
@@ -216,15 +225,12 @@ def _shared(figures: Sequence[FilmFigure], terms: IntArray) -> FloatArray:
 
 
 def _alike(figures: Sequence[FilmFigure]) -> FloatArray:
-    """Covariance (2, n, n) of misfits of size 1: one that is the same in all sets, and one that follows the sag."""
+    """Covariance (growths, n, n) over the sets of a misfit of size 1 that grows with these powers of the sag."""
     sags = np.array([each.sag_mm for each in figures])
-    off = (sags - sags.mean()) / max(float(np.std(sags)), 1e-6)
-    return np.stack([np.ones((sags.size, sags.size)), np.outer(off, off) + _DIFFERS**2 * np.eye(sags.size)])
-
-
-def _relative_spread(figures: Sequence[FilmFigure]) -> float:
-    sags = np.array([each.sag_mm for each in figures])
-    return float(np.std(sags) / np.mean(sags))
+    deeper = sags / sags.mean()
+    grows, off = deeper[:, None] ** _GROWTHS, deeper - 1
+    differs = _UNRELATED**2 * np.outer(off, off) + _DIFFERS**2 * np.var(deeper) * np.eye(sags.size)
+    return np.asarray(np.einsum("ig,jg->gij", grows, grows) + np.multiply.outer(_GROWTHS**2, differs))
 
 
 @dataclass(frozen=True)
@@ -261,27 +267,22 @@ def _averaged(
     known: FloatArray,
     precision: FloatArray,
     seen_mm: float,
-    spread: float,
 ) -> _Solved:
-    """The unknowns averaged over both misfits' sizes: `seen_mm` elsewhere; the sags differ by `spread`, relative."""
+    """The unknowns averaged over the misfit's size, about `seen_mm`, and over the ways in which it grows."""
     found, logs, sizes = [], [], []
-    for common in seen_mm * _TIMES_SEEN:
-        for growth in _GROWTHS:
-            differs = growth * spread * common
-            one = _solved(
-                design, residual, noise + common**2 * misfits[0] + differs**2 * misfits[1], known, precision
-            )
+    for size in seen_mm * _TIMES_SEEN:
+        for misfit in misfits:
+            one = _solved(design, residual, noise + size**2 * misfit, known, precision)
             found.append(one)
-            sizes.append(common**2 + differs**2)
-            unlike = np.log([common / seen_mm, growth]) / _UNLIKE
-            logs.append(one.log_evidence - float(np.sum(np.log1p(unlike**2))))
+            sizes.append(size)
+            logs.append(one.log_evidence - float(np.log1p((np.log(size / seen_mm) / _UNLIKE) ** 2)))
     weight = np.exp(np.array(logs) - np.max(logs))
     weight /= weight.sum()
     means = np.array([one.mean for one in found])
     mean = weight @ means
     within = np.einsum("k,kij->ij", weight, np.array([one.covariance for one in found]))
     covariance = within + np.einsum("k,ki,kj->ij", weight, means - mean, means - mean)
-    return _Solved(mean, covariance, float(np.max(logs)), float(np.sqrt(weight @ np.array(sizes))))
+    return _Solved(mean, covariance, float(np.max(logs)), float(np.sqrt(weight @ np.square(sizes))))
 
 
 def _terms(order: int) -> IntArray:
@@ -303,7 +304,7 @@ def _fit_ring(
     """Waves of the ring, and what they add to the figures' parameters (n, 36)."""
     added = np.zeros((len(figures), TERMS))
     waves = []
-    alike, relative = _alike(figures), _relative_spread(figures)
+    alike = _alike(figures)
     for order in (1, 2, 3):
         causes: list[HarmonicCause] = ["prestrain", "flat", "round"] if order > 1 else ["prestrain", "round"]
         terms = _terms(order)
@@ -315,7 +316,7 @@ def _fit_ring(
             data = np.array([each.parameters_mm[terms[parity]] for each in figures]).ravel()
             noise = _shared(figures, terms[parity]) + 1e-14 * np.eye(data.size)
             spread = np.stack([np.kron(part, np.eye(terms.shape[1])) for part in alike])
-            allowed = _averaged(design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm, relative)
+            allowed = _averaged(design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm)
             found.append(allowed)
             added[:, terms[parity]] = (response @ allowed.mean).reshape(len(figures), -1)
         for k, cause in enumerate(causes):

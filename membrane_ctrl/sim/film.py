@@ -5,12 +5,13 @@ Under a gauge pressure p a Hencky film's sag and volume both go with (J p)^(1/3)
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.polynomial import Chebyshev, Polynomial, chebyshev
-from scipy.optimize import brentq
+from numpy.polynomial import Chebyshev, Polynomial, chebyshev, legendre
+from scipy.optimize import brentq, fsolve
 
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -76,60 +77,71 @@ def solve(poisson: float = POISSON_PET) -> Hencky:
     return Hencky(float(fall.sum()) / 4, float(np.dot(k + 1, profile[1:] / (k + 2))), profile)
 
 
-# A film that was stretched before it was clamped, or is of another material: by collocation, for its pictures.
+# A film that was stretched before it was clamped, or is of another material, for pictures: the least of its energy.
 #
-# With N in units of E t, q = p a / (E t) and the depth in radii, on u in [0, 1]:
+# No slope is called small: Green's strains in Hooke's law, and the work of a pressure that stays normal to the film,
+# the load q = p a / (E t) times the volume. With u outward and w down at the radius r of the flat film, all in radii:
 #
-#     4 u N'' + 8 N' + q^2 / (8 N^2) = 0,   2 N'(1) + (1 - nu) N(1) = prestrain,   depth = integral of q / (4 N).
+#     e_r = prestrain + u' + (u'^2 + w'^2) / 2,   e_t = prestrain + u / r + (u / r)^2 / 2,
+#     energy = integral of (e_r^2 + e_t^2 + 2 nu e_r e_t) / (2 (1 - nu^2)) r dr - q integral of w (r + u) (1 + u') dr.
 
-_DEGREE = 28
-_PROFILE_DEGREE = 18  # exact to the last bit; powers of u lose digits beyond
+_SHAPES = 13  # Legendre terms of u and of w: the slopes are exact to 1e-12
+_PROFILE_DEGREE = 18  # exact to the last bit; powers of rho^2 lose digits beyond
 
 
 @cache
 def stretched(depth: float, prestrain: float, poisson: float) -> tuple[float, FloatArray]:
-    """Load q and profile of a film: element k of the profile multiplies u^k, height for a depth of 1.
+    """Load q and profile of a film: element k of the profile multiplies rho^(2k), height for a depth of 1.
 
-    Raises ValueError if the film would be slack at its ring.
+    rho is where the film is under its load. Raises ValueError if the film would be slack at its ring.
     """
-    nodes, weights = chebyshev.chebgauss(_DEGREE)[0], np.polynomial.legendre.leggauss(_DEGREE)
-    places = np.concatenate([nodes, weights[0], [1.0]])
-    table = chebyshev.chebvander(places, _DEGREE)
-    slope = 2 * chebyshev.chebval(places, chebyshev.chebder(np.eye(_DEGREE + 1))).T
-    bend = 4 * chebyshev.chebval(nodes, chebyshev.chebder(np.eye(_DEGREE + 1), 2)).T
-    u = (nodes[:, None] + 1) / 2
-    at, inside, rim = slice(_DEGREE), slice(_DEGREE, -1), 2 * slope[-1] + (1 - poisson) * table[-1]
-    force = np.zeros(_DEGREE + 1)
-    force[0] = depth**2 + max(prestrain, 0.0) / (1 - poisson)
-    q = 4 * depth * force[0]
-    linear = 4 * u * bend + 8 * slope[at]
-    for _ in range(50):
-        n, fall = table @ force, weights[1] / 8  # of q / N
-        residual = np.concatenate(
-            [
-                linear @ force + q**2 / (8 * n[at] ** 2),
-                [rim @ force - prestrain, q * fall @ (1 / n[inside]) - depth],
-            ]
-        )
-        matrix = np.zeros((_DEGREE + 2, _DEGREE + 2))
-        matrix[:-2, :-1] = linear - (q**2 / (4 * n[at] ** 3))[:, None] * table[at]
-        matrix[:-2, -1] = q / (4 * n[at] ** 2)
-        matrix[-2, :-1] = rim
-        matrix[-1, :-1], matrix[-1, -1] = -q * (fall / n[inside] ** 2) @ table[inside], fall @ (1 / n[inside])
-        step = np.linalg.solve(matrix, -residual)
-        # a film stays taut on the way: no step takes more than half of its force
-        step *= min(1.0, 0.5 / float(np.max(np.abs(table @ step[:-1] / n))))
-        force, q = force + step[:-1], q + float(step[-1])
-        if np.max(np.abs(step)) < 1e-16:
-            break
-    if (table @ force)[_DEGREE:].min() < 0.2 * force[0]:
+    depth = depth or 1e-9  # a flat film bends as the shallowest does
+    x, weight = legendre.leggauss(6 * _SHAPES)
+    v = (x + 1) / 2
+    r, area = np.sqrt(v), weight / 4
+    (wide, wide_r), (deep, deep_r) = _shapes(v)
+    vertex = _shapes(np.zeros(1))[1][0][:, 0]
+
+    def forces(u: FloatArray, u_r: FloatArray, w_r: FloatArray) -> tuple[FloatArray, FloatArray]:
+        along, around = prestrain + u_r + (u_r**2 + w_r**2) / 2, prestrain + u / r + (u / r) ** 2 / 2
+        return (along + poisson * around) / (1 - poisson**2), (around + poisson * along) / (1 - poisson**2)
+
+    # a film's strain is its pre-strain and the square of its depth: with these units any film is of order 1
+    strain = depth**2 + max(prestrain, 0.0)
+    units = np.concatenate([np.full(_SHAPES, depth**2), np.full(_SHAPES, depth), [strain * depth]])
+
+    def gradient(scaled: FloatArray) -> FloatArray:
+        u, w, push = np.split(scaled * units, [_SHAPES, 2 * _SHAPES])
+        push = push * area / r
+        out, out_r, down, down_r = u @ wide, u @ wide_r, w @ deep, w @ deep_r
+        pull, hoop = (area * force for force in forces(out, out_r, down_r))
+        of_u = wide_r @ (pull * (1 + out_r) - push * down * (r + out)) + wide / r @ (hoop * (1 + out / r))
+        of_u -= wide @ (push * down * (1 + out_r))
+        of_w = deep_r @ (pull * down_r) - deep @ (push * (r + out) * (1 + out_r))
+        return np.concatenate([of_u / strain, of_w / (strain * depth), [w @ vertex / depth - 1]])
+
+    start = np.zeros(2 * _SHAPES + 1)
+    start[_SHAPES], start[-1] = 1.0, 4.0
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of slow progress at the last bits
+        found = np.asarray(fsolve(gradient, start, xtol=1e-15, maxfev=20_000))
+    u, w, load = np.split(found * units, [_SHAPES, 2 * _SHAPES])
+    pull, _ = forces(u @ wide, u @ wide_r, w @ deep_r)
+    if np.abs(gradient(found)).max() > 1e-11 or pull.min() < 0.2 * pull[0]:
         raise ValueError(f"prestrain = {prestrain:g}: the film would be slack at its ring")
-    fall_of_u = Chebyshev.interpolate(
-        lambda v: q / (4 * chebyshev.chebval(2 * v - 1, force)), _PROFILE_DEGREE, domain=[0, 1]
-    )
-    return q, np.asarray(
-        (fall_of_u.integ(lbnd=0) / depth).convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
-    )
+    at = (chebyshev.chebpts2(8 * _PROFILE_DEGREE) + 1) / 2
+    (out, _), (down, _) = (tables for tables in _shapes(at))
+    rho2 = (np.sqrt(at) + u @ out) ** 2
+    profile = Chebyshev.fit(rho2, 1 - w @ down / depth, _PROFILE_DEGREE, domain=[0, 1])
+    powers = profile.convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
+    return float(load[0]), np.concatenate([[0.0], powers[1:]])
+
+
+def _shapes(v: FloatArray) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Displacements outward, r (1 - v) P(v), and down, (1 - v) P(v), with v = r^2, and their derivatives along r."""
+    r, eye = np.sqrt(v), np.eye(_SHAPES)
+    value, slope = legendre.legval(2 * v - 1, eye), 2 * legendre.legval(2 * v - 1, legendre.legder(eye))
+    down, down_r = (1 - v) * value, 2 * r * ((1 - v) * slope - value)
+    return (r * down, down + r * down_r), (down, down_r)
 
 
 RADIUS_MM = 500.0

@@ -213,10 +213,37 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
     rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * len(film_law.BEYOND))
     if film == "prestressed":
         excess_mm, step_mm = surface.parameters[-1], 1e-5
-        here, there = (film_law.beyond_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
+        here, there = (beyond_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
         rows[:, PARAMETERS - 1] = (here - there) / step_mm
         rows[:, -1] += here
     return rows / (_FREE_MM if film == "free" else _LAW_MM)
+
+
+@cache
+def _family() -> tuple[FloatArray, FloatArray]:
+    """Legendre degree 4 (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
+    rows = []
+    for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
+        bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), film_law.POISSON_RATIO, 1.0)
+        coef = film_law.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
+        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (4, *film_law.BEYOND)])
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:]
+
+
+def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
+    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at this sag.
+
+    At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
+    """
+    own = (
+        film_law.profile_legendre().coef[[4, *film_law.BEYOND]]
+        / np.sqrt(2 * np.array([4, *film_law.BEYOND]) + 1)
+        / film_law.excess_rms()
+    )
+    fourth, others = _family()
+    there = [np.interp(excess_mm * own[0] / sag_mm, fourth, other) for other in others.T]
+    return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
 
 
 def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:

@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from scipy.integrate import quad
 from scipy.special import jn_zeros, jv
 
-from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.metrology.optics.film_law import FilmLaw, finite_rise_mm
 from membrane_ctrl.sim import film as hencky
 from membrane_ctrl.sim.optics.film_shape import (
     DRUM_MODES,
@@ -71,12 +71,17 @@ def test_the_bowl_holds_the_volume_that_the_gas_sees() -> None:
 
 @pytest.mark.parametrize(("prestrain", "poisson"), [(0.0, 0.3), (8e-4, 0.38), (-3e-4, 0.2), (2e-2, 0.3)])
 def test_a_stretched_film_is_the_laws(prestrain: float, poisson: float) -> None:
-    """Collocation against the scaled series of the metrology: neither knows of the other."""
+    """The least energy against the balance of forces of the metrology: neither knows of the other."""
     load, profile = hencky.stretched(0.074, prestrain, poisson)
-    law = FilmLaw(prestrain, poisson, 1.0, 1.0).with_sag(0.074)
-    rho = np.linspace(0, 1, 21)
-    assert load == pytest.approx(float(law.load), rel=1e-11)
-    assert 0.074 * polyval(rho**2, profile) == pytest.approx(law.height_mm(rho), abs=1e-11)
+    law = FilmLaw(prestrain, poisson, 1.0, 1.0)
+    rho = np.linspace(0.02, 1, 21)
+    rises = 0.074 * 2 * rho * polyval(rho**2, polyder(profile))
+    assert rises == pytest.approx(finite_rise_mm(law, load, rho), abs=3e-11)
+    # with small slopes both are Foeppl's
+    load, profile = hencky.stretched(1e-3, max(prestrain, 0.0), poisson)
+    bowl = FilmLaw(max(prestrain, 0.0), poisson, 1.0, 1.0).with_sag(1e-3)
+    assert load == pytest.approx(float(bowl.load), rel=1e-6)
+    assert 1e-3 * polyval(rho**2, profile) == pytest.approx(bowl.height_mm(rho), abs=1e-9)
 
 
 def test_a_stretched_film_keeps_its_ring_and_changes_its_profile() -> None:
