@@ -40,7 +40,8 @@ def check(scene: Scene) -> State:
     gone = not scene.now_s - scene.last_good_s <= scene.config.limits.stale_s
     good_s = scene.stay_good(not gone)
     if scene.state_age_s > scene.config.states.check_timeout_s + scene.observer.waited_s:
-        scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {missing}"
+        why = missing or "readings come and go, or the actuator test is not done"
+        scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {why}"
     if gone:
         scene.test = None  # repeat a measurement with a gap
         scene.why = f"checking the sensors: {missing}"

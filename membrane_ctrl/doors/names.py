@@ -33,7 +33,7 @@ _TICK = (
     Published("error_um", "um", "setpoint minus laser"),
     Published("setpoint_um", "um", "setpoint of the loop, with the trim"),
     Published("target_um", "um", "end of the setpoint's ramp"),
-    Published("displacement_um", "um", "laser reading"),
+    Published("displacement_um", "um", "laser reading, or the optics' on a bench held without a laser"),
     Published("trim_um", "um", "shape loop's part of the setpoint"),
     Published("flow_um_per_s", "um/s", "pump's flow, as motion of the centre"),
     Published("leak_um_per_s", "um/s", "leak, as motion of the centre"),

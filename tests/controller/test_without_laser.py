@@ -149,6 +149,17 @@ def test_a_start_waits_for_a_camera_that_prepares(
     assert [fault.seen for fault in told(ticks, Fault)] == ([] if starts else [why])
 
 
+def test_figures_that_come_and_go_end_the_check_with_the_reason() -> None:
+    """A machine too busy to track: the actuator test begins again after every gap."""
+
+    def busy(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = now_s % 3.0 > 1.2
+
+    (fault,) = told(held(17.0, busy), Fault)
+    assert fault.name == "overdue"
+    assert fault.seen.endswith("readings come and go, or the actuator test is not done")
+
+
 @pytest.mark.parametrize(
     ("spoil", "seen"),
     [
