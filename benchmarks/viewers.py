@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import psutil
 import socketio
-from aiohttp import ClientSession, CookieJar
+from aiohttp import ClientConnectionError, ClientSession, CookieJar
 
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.run_files.run import open_run
@@ -75,11 +75,19 @@ class Viewer:
 
     async def _fetched(self, paths: list[str], answer_to: str) -> None:
         for path in paths:
-            async with self._http.get(f"{self._base}{path}") as answer:
-                if answer.status != 200 or not await answer.read():
-                    self.failed = f"{path}: {answer.status}"
+            try:
+                status = await self._got(path)
+            except ClientConnectionError:  # the server closed an idle connection meanwhile: a browser asks again
+                status = await self._got(path)
+            if status != 200:
+                self.failed = f"{path}: {status}"
         if answer_to and self.socket.connected:
             await self.socket.emit("javascript_response", {"client_id": self._client, "request_id": answer_to})
+
+    async def _got(self, path: str) -> int:
+        """Status of the answer; 204 for one that is empty."""
+        async with self._http.get(f"{self._base}{path}") as answer:
+            return answer.status if await answer.read() else 204
 
     def judged(self) -> tuple[float, str]:
         """The longest time without an update, s, and what went wrong."""
