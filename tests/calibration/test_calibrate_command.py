@@ -219,16 +219,14 @@ def test_a_sphere_beside_the_film_sharpens_the_sag(
     alone = json.loads(calibrated.read_text())
     assert alone["artefact_advice"]["sag_um"] < 0.5 * alone["uncertainty"]["sag_um"]
     out = tmp_path / "g.toml"
-    assert run(["calibrate", str(sphere), *map(str, folders[1:4]), "--out", str(out), "--json", "--no-pictures"]) == 0
+    assert run(["calibrate", str(sphere), str(folders[2]), "--out", str(out), "--json", "--no-pictures"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert [row["surface"] for row in report["sets"]] == ["sphere", "film", "film", "film"]
+    assert [row["surface"] for row in report["sets"]] == ["sphere", "film"]
     assert report["uncertainty"]["sag_um"] < 0.5 * alone["uncertainty"]["sag_um"]
     found = {row["name"]: row for row in report["parameters"]}
     for name, true in (("a_mm", 2.0), ("b_mm", -2.0), ("focal_relative", 0.0), ("pitch_relative", 0.0)):
         assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"], name
-    assert tomllib.loads(out.read_text())["calibration"]["sets"] == ["sphere", "set1", "set2", "set3"]
-    # the mirror is the film's, not the sphere's
-    assert run(["measure", str(folders[2]), "--geometry", str(out), "--no-pictures", "--json"]) == 0
+    assert tomllib.loads(out.read_text())["calibration"]["sets"] == ["sphere", "set2"]
 
 
 @pytest.mark.parametrize(
@@ -260,8 +258,8 @@ def test_artefacts_alone_are_refused(sphere: Path, tmp_path: Path, capsys: pytes
 def test_a_film_that_moves_within_its_sets_calibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A drift that brings the y frames to another bowl than the x frames; the laser saw it, with its noise."""
     moving = []
-    for k, drift_um_per_s in enumerate((12.0, -20.0, 30.0)):
-        motion = Motion(start_um=(-4000.0, 0.0, 4000.0)[k], drift_um_per_s=drift_um_per_s)
+    for k, drift_um_per_s in enumerate((12.0, -20.0)):
+        motion = Motion(start_um=(-4000.0, 4000.0)[k], drift_um_per_s=drift_um_per_s)
         moving.append(set_of(tmp_path / f"{k}", FILM, motion=motion, laser_noise_um=1.0, seed=k + 20))
     words = ["calibrate", *map(str, moving), "--out", str(tmp_path / "g.toml"), "--json", "--no-pictures"]
     assert run(words) == 0

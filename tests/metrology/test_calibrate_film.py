@@ -97,6 +97,7 @@ def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() ->
         assert all(least <= trust.variance <= most for trust in found), shared
 
 
+@pytest.mark.campaign
 def test_a_film_that_moved_from_the_x_to_the_y_frames_is_found_to_have_moved() -> None:
     """x of a bowl that is deeper, y of one that is less deep, unseen by the laser."""
     moved_um = np.array([0.9, -0.6, 0.0, 1.2, -0.8])

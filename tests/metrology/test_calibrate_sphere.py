@@ -111,6 +111,7 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     assert artefact_advice(obeyed, 3) is None
 
 
+@pytest.mark.campaign
 def test_a_sphere_that_is_not_as_stated_is_refused_by_its_name() -> None:
     values = drawn(4)
     _, problem = bench_of(values, 4)
