@@ -98,22 +98,16 @@ class Budget:
 
     def sizes(self, covariance_mm2: FloatArray) -> dict[str, float]:
         """1 sigma of the sag, and over the disc of the height and of the figure (the height without its plane)."""
-        gradient = sag_gradient()
-        of_height, of_figure = _mean_products(self.disc)
-        squares = {
-            "sag_um": gradient @ covariance_mm2 @ gradient,
-            "height_rms_um": np.sum(of_height * covariance_mm2),
-            "figure_rms_um": np.sum(of_figure * covariance_mm2),
-        }
+        squares = {name: np.sum(means * covariance_mm2) for name, means in _products(self.disc).items()}
         return {name: 1e3 * math.sqrt(max(float(square), 0.0)) for name, square in squares.items()}
 
 
 @lru_cache
-def _mean_products(disc: float) -> tuple[FloatArray, FloatArray]:
-    """Means (36, 36) over a disc of products of two parameters' heights, and of their figures."""
+def _products(disc: float) -> dict[str, FloatArray]:
+    """Means (36, 36) over a disc of products of what two parameters do to sag, height and figure."""
     heights, plane = propagate.disc(disc)
-    figure = propagate.without_plane(heights, plane)
-    return heights.T @ heights / len(heights), figure.T @ figure / len(figure)
+    basis = {"height_rms_um": heights, "figure_rms_um": propagate.without_plane(heights, plane)}
+    return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {n: b.T @ b / len(b) for n, b in basis.items()}
 
 
 def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float = 1.0) -> Iterator[Source]:
