@@ -136,7 +136,7 @@ def test_a_film_that_is_not_henckys(prestrain: float, poisson: float) -> None:
         for one in (found, set_of_the_stated_bench())
     )
     assert abs(found.sag_um) == pytest.approx(row["sag_um"], rel=0.5)
-    assert row["sag_um"] > 0.15 > 3 * none["sag_um"]
+    assert row["sag_um"] > 0.09 > 4 * none["sag_um"]
 
 
 @pytest.mark.parametrize(
