@@ -118,7 +118,7 @@ def _plain(problem: Problem) -> Problem:
     return Problem(problem.stated, tuple(sets), sigmas(held), References(0.0, 1.0, 1e6), problem.radius_mm)
 
 
-def _errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:
+def errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:
     """Of the sag at 475 mm, and RMS of the figure inside it without the best plane."""
     y, x = np.mgrid[-475:476:25, -475:476:25].astype(float)
     inside = np.hypot(x, y) <= 475
@@ -136,7 +136,7 @@ def _measured(solution: Solution, film: FilmShape) -> tuple[float, float]:
     """The middle set as `measure` would with the calibrated geometry."""
     phases = solution.problem.sets[2]
     surface = fit_on(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um).surface
-    return _errors_um(surface, film, MOVED_UM[2])
+    return errors_um(surface, film, MOVED_UM[2])
 
 
 def _rms(values: list[tuple[float, float]], which: int) -> float:
@@ -149,7 +149,7 @@ def _accuracy() -> list[Figure]:
         film, sets = _rendered(seed)
         problem = _problem(sets)
         stated = fit_on(BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um).surface
-        none.append(_errors_um(stated, film, MOVED_UM[2]))
+        none.append(errors_um(stated, film, MOVED_UM[2]))
         plain.append(_measured(solve(_plain(problem)), film))
         full.append(_measured(solve(problem), film))
     where = f"({SEEDS} seeds, a quarter of the resolution)"
@@ -172,7 +172,7 @@ def _bowed() -> list[Figure]:
         held.append(_measured(solution, film))
         told += bool(suspects(solution)) and suspects(solution)[0].name == "bow_mm"
         solution = solve(_problem(sets, {"bow_mm": 1.5}))
-        freed.append(_errors_um(solution.states[2].surface, film, MOVED_UM[2]))
+        freed.append(errors_um(solution.states[2].surface, film, MOVED_UM[2]))
     return [
         at_least("screen bowed by 1 mm: named", told / BOWED_SEEDS, "share", 1.0),
         at_most("... figure error with the bow freed", _rms(freed, 1), "um", 8.0, "bow held", _rms(held, 1)),

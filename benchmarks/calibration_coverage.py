@@ -10,7 +10,6 @@ rulers and data sheets, with a set of a sphere in the mirror's place. Its radius
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from dataclasses import dataclass, replace
@@ -20,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.coverage import BentRays, FloatArray, Room, stated_bench, stated_sigmas, true_bench
+from benchmarks.calibration import errors_um
+from benchmarks.coverage import BentRays, FloatArray, Room, answers, stated_bench, stated_sigmas, true_bench
 from benchmarks.figures import Figure, at_most
 from membrane_ctrl.calibration.sets import Bundle, CalibrateOptions, phases_of, problem_of
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig
@@ -149,19 +149,6 @@ def calibrated(drawn: DrawnBench, seed: int) -> tuple[Solution, list[float]]:
     return solve(problem_of(bundle, {}, options)), true_um
 
 
-def errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:
-    """Of the sag at 475 mm, and RMS of the figure inside without the best plane."""
-    y, x = np.mgrid[-475:476:25, -475:476:25].astype(float)
-    inside = np.hypot(x, y) <= 475
-    x, y = x[inside], y[inside]
-    error = surface.height(x, y) - film.height_mm(x, y, moved_um)
-    plane = np.stack([np.ones_like(x), x, y], axis=1)
-    figure = error - plane @ np.linalg.lstsq(plane, error, rcond=None)[0]
-    theta = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    rim = 475 * np.cos(theta), 475 * np.sin(theta)
-    return 1e3 * float(np.mean(surface.height(*rim) - film.height_mm(*rim, moved_um))), 1e3 * float(figure.std())
-
-
 def bench(seed: int) -> dict[str, Any]:
     """Errors and claims of one bench."""
     drawn = DrawnBench.drawn(seed)
@@ -190,22 +177,9 @@ def _free(solution: Solution) -> list[tuple[int, tuple[str, float]]]:
     return [(k, (name, float(sigma))) for k, (name, sigma) in named if sigma > 0]
 
 
-def answers(count: int) -> list[dict[str, Any]]:
-    """Those already known, and the missing ones."""
-    ANSWERS.parent.mkdir(exist_ok=True)
-    lines = ANSWERS.read_text(encoding="utf-8").splitlines() if ANSWERS.exists() else []
-    known = {one["seed"]: one for one in map(json.loads, lines)}
-    for seed in range(count):
-        if seed not in known:
-            known[seed] = bench(seed)
-            with ANSWERS.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(known[seed]) + "\n")
-    return [known[seed] for seed in range(count)]
-
-
 def run(count: int = BENCHES) -> list[Figure]:
     """Error over claim, by what is known of the bench."""
-    given, figures = answers(count), []
+    given, figures = answers(ANSWERS, count, bench), []
     for kind, name in enumerate(KINDS):
         some = [one for one in given if one["kind"] == kind]
         good = [one for one in some if "sag_um" in one]

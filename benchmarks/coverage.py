@@ -313,16 +313,15 @@ def bench(seed: int) -> dict[str, Any]:
     }
 
 
-def answers(count: int) -> list[dict[str, Any]]:
-    """Those already known, and the missing ones."""
-    ANSWERS.parent.mkdir(exist_ok=True)
-    known = {}
-    if ANSWERS.exists():
-        known = {one["seed"]: one for one in map(json.loads, ANSWERS.read_text(encoding="utf-8").splitlines())}
+def answers(path: Path, count: int, bench: Callable[[int], dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those already in the file, and the missing ones, which are added to it."""
+    path.parent.mkdir(exist_ok=True)
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    known = {one["seed"]: one for one in map(json.loads, lines)}
     for seed in range(count):
         if seed not in known:
             known[seed] = bench(seed)
-            with ANSWERS.open("a", encoding="utf-8") as file:
+            with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(known[seed]) + "\n")
     return [known[seed] for seed in range(count)]
 
@@ -343,7 +342,7 @@ _PARTS = {"sag": slice(0, 1), "Z4..Z11": slice(1, 9), "map": slice(9, None)}
 
 def run(count: int = BENCHES) -> list[Figure]:
     """Coverage by quantity, for heights and for changes."""
-    given = answers(count)
+    given = answers(ANSWERS, count, bench)
     figures = []
     for state in (False, True):
         some = [one for one in given if one["calibrated"] == state]
@@ -379,4 +378,4 @@ if __name__ == "__main__":
     wanted = int(sys.argv[1]) if len(sys.argv) > 1 else BENCHES
     for figure in run(wanted):
         print(f"{figure.name}: {figure.value:.1f} {figure.unit} {figure.reference_value or ''}")
-    print("\n".join(table(answers(wanted))))
+    print("\n".join(table(answers(ANSWERS, wanted, bench))))
