@@ -129,6 +129,8 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         for name, on in (("barometer", loop.feedforward_barometer), ("thermometer", loop.feedforward_temperature))
         if on
     ]
+    cycle = f"a cycle every {shape.period_s:g} s"
+    figures = f"{shape.track_rate_hz:g} figures/s, tracked" if shape.mode == "track" else cycle
     return {
         "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
         "hold": f"{loop.setpoint_um:g} um at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
@@ -136,7 +138,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "gains": telemetry.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _geometry(config),
-        "shape loop": f"a cycle every {shape.period_s:g} s" if shape.enabled else "off",
+        "shape loop": figures if shape.enabled else "off",
         "control port": _port(config.port),
         "alarms": _alarms(config.alarms),
     }

@@ -23,6 +23,13 @@ def test_the_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     said = would(Config(), capsys)
     assert said["control port"] == "control.sock beside the run folders"
     assert said["alarms"] == "not sent: no alarms.urls_file"
+    assert said["shape loop"] == "a cycle every 2 s"
+
+
+def test_a_hold_that_tracks_is_told_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    config = Config()
+    config = config.model_copy(update={"shape": config.shape.model_copy(update={"mode": "track"})})
+    assert would(config, capsys)["shape loop"] == "20 figures/s, tracked"
 
 
 def test_what_is_configured(
