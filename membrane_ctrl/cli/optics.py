@@ -14,6 +14,15 @@ FaultOption = Annotated[
     list[str] | None,
     typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
 ]
+CoarserOption = Annotated[
+    list[float] | None, typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable.")
+]
+ArtefactOption = Annotated[
+    str,
+    typer.Option(
+        metavar="FORM", help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in the mirror's place, mm."
+    ),
+]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -199,16 +208,8 @@ def simulate(
         int, typer.Option(min=1, help="Number of sets; several make a run: 0000 full, the others fringes.")
     ] = 1,
     interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
-    coarser_mm: Annotated[
-        list[float] | None,
-        typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable."),
-    ] = None,
-    artefact: Annotated[
-        str,
-        typer.Option(
-            metavar="FORM", help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in the mirror's place, mm."
-        ),
-    ] = "",
+    coarser_mm: CoarserOption = None,
+    artefact: ArtefactOption = "",
     track: Annotated[
         int, typer.Option(min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full.")
     ] = 0,

@@ -191,21 +191,13 @@ class GainsTrial:
         """The present gains are not kept yet."""
         return math.isfinite(self._until_s)
 
-    def begin(
-        self,
-        loop: LoopConfig,
-        now_s: float,
-        trial_s: float,
-        shape_time_constant_s: float = math.nan,
-        pump: PumpConfig | None = None,
-        setpoint_step_um: float = math.nan,
-    ) -> None:
-        """Set new gains for `trial_s` seconds, or permanently if that is NaN."""
-        self._tried, self._tried_pump = loop, pump or self._tried_pump
-        self.setpoint_step_um = setpoint_step_um
-        if math.isfinite(shape_time_constant_s):
-            self._tried_shape_s = shape_time_constant_s
-        self._until_s = now_s + trial_s
+    def begin(self, loop: LoopConfig, command: Command, now_s: float) -> None:
+        """Set a command's gains for as many seconds as its value, or permanently if that is NaN."""
+        self._tried, self._tried_pump = loop, command.pump or self._tried_pump
+        self.setpoint_step_um = command.setpoint_step_um
+        if math.isfinite(command.shape_time_constant_s):
+            self._tried_shape_s = command.shape_time_constant_s
+        self._until_s = now_s + command.value
         if not self.on_trial:
             self.keep()
 

@@ -170,14 +170,7 @@ class Controller:
                 self._setpoint_back_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
-                self._gains.begin(
-                    command.loop,
-                    scene.now_s,
-                    command.value,
-                    command.shape_time_constant_s,
-                    command.pump,
-                    command.setpoint_step_um,
-                )
+                self._gains.begin(command.loop, command, scene.now_s)
                 self._set_gains(command.loop)
             case "keep":
                 self._gains.keep()

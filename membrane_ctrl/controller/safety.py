@@ -1,9 +1,8 @@
-"""The safety table: turns a tick's observation into a verdict. No I/O, no clock.
+"""The safety table: turns a tick's observation into a verdict. No I/O, no clock. docs/faults.md is made from it.
 
 `Observation` is what a tick shows. Each `Rule` names a cause, how many of the last ticks must show it (N of M), its
 limit and the safe level it enters. It is judged on every tick in the states where it applies. Of several tripped
-rules the deepest level wins; the operator sees the first cause of a fault. `docs/faults.md` is generated from this
-table.
+rules the deepest level wins; the operator sees the first cause of a fault.
 """
 
 import math
@@ -28,8 +27,7 @@ class Observation:
 
     link_up: bool  # the device link is connected
     reading_age_s: float  # since the last answer of the device
-    # since the device's sample counter and time last advanced; a repeated answer does not count
-    advance_age_s: float
+    advance_age_s: float  # since its sample counter and time last advanced; a repeated answer does not count
     displacement_um: float  # raw laser reading, or by figures on a bench without a laser; NaN if bad or absent
     displacement_valid: bool  # finite, new, of good quality, not a jump
     jumps: int  # consecutive readings refused as jumps
@@ -219,8 +217,7 @@ TABLE: tuple[Rule, ...] = (
         seen=lambda o: o.unseen_film, broken=lambda o, c: bool(o.unseen_film),
     ),
     Rule(
-        code=14, name="laser_implausible",
-        cause="camera and gauge agree that the laser is wrong",
+        code=14, name="laser_implausible", cause="camera and gauge agree that the laser is wrong",
         limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=HOLDING,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
@@ -303,8 +300,8 @@ TABLE: tuple[Rule, ...] = (
     Rule(
         code=26, name="actuator_test", cause="the film does not respond to pump or vent",
         limit="pump_obeys.py", safe_level=SafeLevel.PUMP_OFF, states={State.CHECK},
-        remedy="check hoses, valve and pump, and where the laser points",
-        seen=lambda o: o.unfit, broken=lambda o, c: bool(o.unfit),
+        remedy="check hoses, valve and pump, and where the laser points", seen=lambda o: o.unfit,
+        broken=lambda o, c: bool(o.unfit),
     ),
     Rule(
         code=40, name="late", cause="ticks start too late to control the mirror",
@@ -328,8 +325,7 @@ class SafetyTable:
     """Judges observations by the table; remembers only the last M relevant ticks of each rule."""
 
     def __init__(self, limits: LimitsConfig, table: tuple[Rule, ...] = TABLE) -> None:
-        self._limits = limits
-        self._table = table
+        self._limits, self._table = limits, table
         self._history = [0] * len(table)
 
     def judge(self, state: State, observation: Observation) -> Verdict:

@@ -13,6 +13,7 @@ from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState, State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
@@ -250,22 +251,7 @@ class Holders:
             self._running = True
             self._agreed_mount.reset(scene.trim_um)
             self._stand.lock()
-        off = shape == ShapeState.OFF and not self._by_optics
-        if off:
-            self._locking = True
-        elif self._locking:
-            self._filter.relock()
-            self._locking = False
-        if consistency.agree and self.estimate is not None:
-            self._agreed_mount.update(self.estimate.mount_um, scene.dt_s)
-        elif consistency.camera_lies and self._filter.frames and not self._by_optics:
-            self._filter.blame_optics(self._agreed_mount.value)
-        figure = inputs.estimate
-        if figure and figure.kind == "full" and self._tracks and figure.verdict != "rejected":
-            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
-            figure = None
-        if off or consistency.camera_lies or (figure and figure.verdict == "rejected"):
-            figure = None
+        figure = self._believed_figure(inputs.estimate, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
             gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan, scene.dt_s
@@ -289,6 +275,24 @@ class Holders:
             sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
             self.estimate = replace(self.estimate, sigma_um=sigma_um)
         return news
+
+    def _believed_figure(
+        self, figure: ShapeEstimate | None, dt_s: float, shape: ShapeState, consistency: SensorConsistency
+    ) -> ShapeEstimate | None:
+        """The tick's figure if the filter may use it; locks the filter anew where its reference ended."""
+        off = shape == ShapeState.OFF and not self._by_optics
+        if self._locking and not off:
+            self._filter.relock()
+        self._locking = off
+        if consistency.agree and self.estimate is not None:
+            self._agreed_mount.update(self.estimate.mount_um, dt_s)
+        elif consistency.camera_lies and self._filter.frames and not self._by_optics:
+            self._filter.blame_optics(self._agreed_mount.value)
+        rejected = figure is None or figure.verdict == "rejected"
+        if figure and figure.kind == "full" and self._tracks and not rejected:
+            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
+            return None
+        return None if off or consistency.camera_lies or rejected else figure
 
     def _told_of_stand(self) -> list[Event]:
         """Report once that the optics may be off by the growth of their stand, and once that a new lock ended it."""

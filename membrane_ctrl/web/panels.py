@@ -27,14 +27,13 @@ from membrane_ctrl.web.feed import HoldFeed
 
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
-_LOOK_S = 1.0
+_LOOK_S, _TAKES = 1.0, 5  # looks until a session that asks has taken an answer
 _CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
 <q-checkbox dense v-model="props.selected" :label="props.row.run" />
 <div class="row justify-between q-mt-xs">
 <span v-for="col in props.cols.filter(c => !['run', 'error'].includes(c.name))">
 <span class="text-caption">{{ col.label }}</span> {{ col.value ?? '-' }}</span></div>
 <span v-html="props.row.error"></span></q-card></div>"""  # a run on a phone, which has no room for the table
-_TAKES = 5  # looks until a session that asks has taken an answer
 CHOOSES: Role = "tune"  # as for `ctl gains`
 
 
@@ -103,11 +102,9 @@ def run_lines(logs: Path) -> list[RunLine]:
 @lru_cache(maxsize=4 * _MOST)
 def _picture(folder: Path, ended: float | bool) -> str:
     """The error over the run; kept for runs that have ended, which no longer change."""
-    try:
-        level = open_run(folder).level(60.0, names=("mean_error_um",))
-    except (OSError, ValueError):
-        return ""
-    return sparkline(level["mean_error_um"])
+    with suppress(OSError, ValueError):
+        return sparkline(open_run(folder).level(60.0, names=("mean_error_um",))["mean_error_um"])
+    return ""
 
 
 def run_folder(logs: Path, name: str) -> Path | None:
@@ -236,11 +233,10 @@ class SessionWatch:
         self._reader.read()
         done = frozenset(step for step in folders.STEPS if newest.done(step))
         progress = self._reader.progress
-        table: tuple[tuple[str, ...], ...] = ()
-        if progress.among:
-            with suppress(errors.InputError):
-                table = _table(newest.candidates())
-        return SessionSeen(newest.path, done, progress, table)
+        with suppress(errors.InputError):
+            if progress.among:
+                return SessionSeen(newest.path, done, progress, _table(newest.candidates()))
+        return SessionSeen(newest.path, done, progress)
 
 
 def _table(markdown: str) -> tuple[tuple[str, ...], ...]:

@@ -6,13 +6,11 @@ import asyncio
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import cast
 
 import pytest
 
-from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
@@ -27,6 +25,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.loop_bench import LoopBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
 
 # a power of two, so that the supervisor's sum of periods is exact and both tick at the same instants to the bit
@@ -51,20 +50,11 @@ UPSETS: dict[str, Upset] = {
 }
 
 
-@dataclass
-class Timed:
-    """Plant and board, brought to any later moment, with the upset in between."""
-
-    bench: VirtualBench
-    upset: Upset
-    now_s: float = 0.0
-
-    def upset_before(self, now_s: float) -> None:
-        """Turn the switches as they stand during the period that ends now."""
-        for at_s, lasts in ((FAULT_S, True), (OVER_S, False)):
-            if self.now_s < at_s <= now_s:
-                self.upset(self.bench, lasts)
-        self.now_s = now_s
+def upset_between(bench: VirtualBench, upset: Upset, from_s: float, to_s: float) -> None:
+    """Turn the switches as they stand during the period that ends at `to_s`."""
+    for at_s, lasts in ((FAULT_S, True), (OVER_S, False)):
+        if from_s < at_s <= to_s:
+            upset(bench, lasts)
 
 
 class LoopClock:
@@ -77,55 +67,26 @@ class LoopClock:
         return datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=mono_s)
 
 
-class WaitingBench:
-    """The virtual bench as the supervisor's: whoever asks it something finds it at the event loop's time."""
+class UpsetBench(LoopBench):
+    """The bench with an upset and with shapes."""
 
-    def __init__(self, timed: Timed) -> None:
-        self._timed = timed
-        self._at_s = 0.0
-        self._shape = TruthShape(timed.bench, CONFIG, 5)
-        self._shape_due_s = 0.0
-        self.shapes: RingWriter | None = None
+    def __init__(self, upset: Upset, shapes: RingWriter) -> None:
+        super().__init__(CONFIG)
+        self._upset, self._upset_s = upset, 0.0
+        self._shapes, self._shape, self._shape_due_s = shapes, TruthShape(self.virtual, CONFIG, 5), 0.0
 
-    def _now(self) -> VirtualBench:
-        now_s = asyncio.get_running_loop().time()
-        if now_s > self._at_s:
-            self._timed.upset_before(now_s)
-            self._timed.bench.advance(now_s - self._at_s)
-            self._at_s = now_s
-        return self._timed.bench
+    def before(self, now_s: float) -> None:
+        upset_between(self.virtual, self._upset, self._upset_s, now_s)
+        self._upset_s = now_s
 
     def truth(self) -> tuple[float, float]:
-        truth = self._now().truth
-        if self._at_s >= self._shape_due_s:
+        truth, now_s = self.now().truth, asyncio.get_running_loop().time()
+        if now_s >= self._shape_due_s:
             self._shape_due_s += CONFIG.shape.period_s
-            estimate = self._shape(self._at_s)
-            if estimate is not None and self.shapes is not None:
-                self.shapes.put(pack_estimate(estimate))
+            estimate = self._shape(now_s)
+            if estimate is not None:
+                self._shapes.put(pack_estimate(estimate))
         return truth.displacement_um, truth.laser_bias_um
-
-    async def open(self) -> BenchIdentity:
-        self._now().open()
-        return cast(BenchIdentity, None)  # nobody asks who it is
-
-    async def read(self) -> BenchReading:
-        return self._now().read()
-
-    async def write(self, command: BenchCommand) -> None:
-        self._now().write(command)
-
-    async def clear_faults(self, mask: int) -> None:
-        self._now().clear_faults(mask)
-
-    def dead_guards(self) -> tuple[str, ...]:
-        return ()
-
-    async def close(self) -> None:
-        self._now().close()
-
-
-def made(upset: Upset) -> Timed:
-    return Timed(VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), upset)
 
 
 def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
@@ -140,8 +101,7 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
             reader = RingReader(addresses["shapes"])
             for end in (telemetry, events, shapes, reader):
                 stack.callback(end.close)
-            bench = WaitingBench(made(upset))
-            bench.shapes = shapes
+            bench = UpsetBench(upset, shapes)
             wiring = Wiring(
                 bench, telemetry, events, shapes=newest_of(reader), truth=bench.truth, heard={"test": heard.append}
             )
@@ -156,18 +116,18 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
 
 def virtual(upset: Upset) -> tuple[list[TickOutputs], Exit | None]:
     """The same without them."""
-    timed = made(upset)
-    truth = TruthShape(timed.bench, CONFIG, 5)
+    bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump))
+    truth = TruthShape(bench, CONFIG, 5)
 
     def shape(now_s: float) -> ShapeEstimate | None:
         estimate = truth(now_s)
         return None if estimate is None else unpack_estimate(pack_estimate(estimate))
 
-    run = VirtualRun(CONFIG, timed.bench, zernike_projection(), shape)
+    run = VirtualRun(CONFIG, bench, zernike_projection(), shape)
     outputs: list[TickOutputs] = []
     while run.finished is None:
         next_s = run.now_s + 1.0 / RATE_HZ
-        timed.upset_before(next_s)
+        upset_between(bench, upset, run.now_s, next_s)
         tick = run.tick((HOLD,) * (next_s == 1.0 / RATE_HZ) + (STOP,) * (next_s == LASTS_S))
         assert tick is not None
         outputs.append(tick.outputs)

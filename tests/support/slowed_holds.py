@@ -24,7 +24,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.server import Port, RunHooks
@@ -38,8 +37,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes import ring
-from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual_bench import VirtualBench
+from tests.support.loop_bench import LoopBench
 
 _SHAPE_BYTES = 1 << 16
 _START_S = 180.0
@@ -66,43 +64,11 @@ class _Slowed(selectors.DefaultSelector):  # type: ignore[misc,valid-type]  # th
         return super().select(None if timeout is None else timeout * self._slowness)
 
 
-class _Board:
-    """The board in memory, advanced to the loop's time at each access."""
-
-    def __init__(self, config: Config) -> None:
-        self.virtual = VirtualBench(Plant(config.twin, config.pump))
-        self._at_s = asyncio.get_running_loop().time()
-
-    def _now(self) -> VirtualBench:
-        now_s = asyncio.get_running_loop().time()
-        self.virtual.advance(now_s - self._at_s)
-        self._at_s = now_s
-        return self.virtual
-
-    async def open(self) -> BenchIdentity:
-        return self._now().open()
-
-    async def read(self) -> BenchReading:
-        return self._now().read()
-
-    async def write(self, command: BenchCommand) -> None:
-        self._now().write(command)
-
-    async def clear_faults(self, mask: int) -> None:
-        self._now().clear_faults(mask)
-
-    def dead_guards(self) -> tuple[str, ...]:
-        return ()
-
-    async def close(self) -> None:
-        self._now().close()
-
-
 async def hold(logs: Path, number: int) -> None:
     """Hold until cancelled."""
     config = Config()
     config = config.model_copy(update={"twin": config.twin.model_copy(update={"seed": number})})
-    loop, board, ticks = asyncio.get_running_loop(), _Board(config), list[tuple[float, float, float]]()
+    loop, board, ticks = asyncio.get_running_loop(), LoopBench(config), list[tuple[float, float, float]]()
     begin_s, utc = loop.time(), datetime.now(UTC)
     run = logs / f"{utc:%Y%m%dT%H%M%SZ}-held"
     await asyncio.to_thread(run.mkdir, parents=True)

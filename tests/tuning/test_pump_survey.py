@@ -23,8 +23,8 @@ from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreig
 from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
-from tuning.identification.pump_curve import Branch, FlowAt, Level, PumpFit, PumpRun, fit, smoothed
-from tuning.identification.pump_map import PumpMap
+from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
+from tuning.identification.pump_map import Branch, PumpMap, smoothed
 from tuning.identification.pump_survey import PumpSurvey
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig

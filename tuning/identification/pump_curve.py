@@ -27,11 +27,6 @@ _TURNS, _ENOUGH = 8, 0.2  # of the likelihood's search
 _OFF = np.array([-3, -2])  # columns of delay and lag
 _OFF_S, _SLOPE_S = 1.0, 0.05  # what delay and lag may be off; for their slopes
 _LEAST_S, _MOST_S = 0.01, 4.0
-_ROUGH = np.geomspace(0.02, 2e4, 8)  # of the curve: square of its second derivative, of the full flow
-_KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
-_AT_ONCE = (0.0, 0.1)  # ... square of the flow with which it starts ...
-_SLOPE = 10.0  # ... and of its slope there
-_CLEAR = 3.0  # standard errors: a flow beyond doubt
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -58,20 +53,6 @@ class FlowAt:
 
     flow_um_per_s: float
     sigma_um_per_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Branch:
-    """Flows in um/s of the commands reached from below, or of those from above, arrays (n,)."""
-
-    fractions: FloatArray
-    flows: FloatArray
-    sigmas: FloatArray
-
-    @property
-    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """All three."""
-        return self.fractions, self.flows, self.sigmas
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,32 +308,3 @@ def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, Floa
     values = inverse @ (gram[:-1, -1] / scale) / scale
     variance = max(float(gram[-1, -1] - values @ gram[:-1, -1]) / max(1, rows - scale.size), 1e-12)
     return variance, values, variance * inverse / np.outer(scale, scale)
-
-
-def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that of the flows.
-
-    The first is at command 0. The average over curves by their likelihood: nothing up to one of the commands, then
-    perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as most curves are smooth and some
-    have kinks. A spline from command 0 would carry its certainty of no flow into a dead zone.
-    """
-    full = max(float(flows.max()), 1e-3)
-    y, noise = flows / full, noise / full**2
-    none = int(np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True)))  # the first certain flow
-    found: list[tuple[float, FloatArray, FloatArray]] = []
-    for last in range(max(none, 1)):
-        x = np.maximum(fractions - fractions[last], 0.0)
-        low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
-        bend, jump = low**2 * (3 * high - low) / 6, np.outer(x > 0, x > 0)
-        for rough, kinked, at_once in product(_ROUGH, _KINKED, _AT_ONCE):
-            free = _SLOPE * np.outer(x, x) + rough * bend + kinked * low + at_once * jump
-            weights = np.linalg.solve(free + noise, free).T
-            cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
-            found.append((cost, weights @ y, free - weights @ free))
-    costs, means, covariances = (np.array(column) for column in zip(*found, strict=True))
-    share = np.exp(-0.5 * (costs - costs.min()))
-    share /= share.sum()
-    mean = share @ means
-    apart = means - mean
-    spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
-    return full * mean, full**2 * spread

@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import BLOCK_S, Branch, PumpFit
+from tuning.identification.pump_curve import BLOCK_S, PumpFit
 
 _USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it there is no curve
 _STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
@@ -22,6 +23,27 @@ _ASTRAY = (
     "or the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
     "(loop.bleed_fraction)"
 )
+_ROUGH = np.geomspace(0.02, 2e4, 8)  # of the curve: square of its second derivative, of the full flow
+_KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
+_AT_ONCE = (0.0, 0.1)  # ... square of the flow with which it starts ...
+_SLOPE = 10.0  # ... and of its slope there
+_CLEAR = 3.0  # standard errors: a flow beyond doubt
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """Flows in um/s of the commands reached from below, or of those from above, arrays (n,)."""
+
+    fractions: FloatArray
+    flows: FloatArray
+    sigmas: FloatArray
+
+    @property
+    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """All three."""
+        return self.fractions, self.flows, self.sigmas
+
+
 NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
 
 
@@ -196,3 +218,32 @@ def first_jump(branch: Branch, full: float) -> tuple[float, float] | None:
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(round(value, 4) for value in values.tolist())
+
+
+def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that of the flows.
+
+    The first is at command 0. The average over curves by their likelihood: nothing up to one of the commands, then
+    perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as most curves are smooth and some
+    have kinks. A spline from command 0 would carry its certainty of no flow into a dead zone.
+    """
+    full = max(float(flows.max()), 1e-3)
+    y, noise = flows / full, noise / full**2
+    none = int(np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True)))  # the first certain flow
+    found: list[tuple[float, FloatArray, FloatArray]] = []
+    for last in range(max(none, 1)):
+        x = np.maximum(fractions - fractions[last], 0.0)
+        low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
+        bend, jump = low**2 * (3 * high - low) / 6, np.outer(x > 0, x > 0)
+        for rough, kinked, at_once in product(_ROUGH, _KINKED, _AT_ONCE):
+            free = _SLOPE * np.outer(x, x) + rough * bend + kinked * low + at_once * jump
+            weights = np.linalg.solve(free + noise, free).T
+            cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
+            found.append((cost, weights @ y, free - weights @ free))
+    costs, means, covariances = (np.array(column) for column in zip(*found, strict=True))
+    share = np.exp(-0.5 * (costs - costs.min()))
+    share /= share.sum()
+    mean = share @ means
+    apart = means - mean
+    spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
+    return full * mean, full**2 * spread

@@ -13,8 +13,17 @@ import numpy as np
 
 from membrane_ctrl.control.experiments.trial import PumpStep
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import NO_FIT, Branch, Level, PumpFit, PumpRun, fit, smoothed
-from tuning.identification.pump_map import JUMP_SHARE, NO_BRANCH, PumpMap, Surveyed, first_jump, stuck
+from tuning.identification.pump_curve import NO_FIT, Level, PumpFit, PumpRun, fit
+from tuning.identification.pump_map import (
+    JUMP_SHARE,
+    NO_BRANCH,
+    Branch,
+    PumpMap,
+    Surveyed,
+    first_jump,
+    smoothed,
+    stuck,
+)
 
 _KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
 _BENT_SHARE = 0.025  # of the full flow, by which a kink between two levels may be hidden

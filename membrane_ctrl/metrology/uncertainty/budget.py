@@ -122,8 +122,7 @@ def geometry_sources(bench: TrialBench, spread: GeometrySpread, widened: float =
         yield Source("geometry", f"poses and optics, with their correlations: {several}", math.nan, effects)
     for k in np.flatnonzero(~linked):
         name, sigma = spread.names[k], float(spread.sigmas[k])
-        effect = jacobian[:, k] * sigma
-        yield Source(name, says.get(name, name), widened * sigma, effect[:, None])
+        yield Source(name, says.get(name, name), widened * sigma, jacobian[:, [k]] * sigma)
 
 
 def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
