@@ -126,12 +126,11 @@ class CentreFilter:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
         pressure_pa, air_c = believed_weather(given.ambient_pressure_pa, given.air_temperature_c)
         config = self._config
-        if self._uses[0] and math.isfinite(pressure_pa):
-            pressure_pa = self._from_origin(0, pressure_pa)
-            self._take(Sensor.BAROMETER, ((_AMBIENT, 1.0),), pressure_pa, config.barometer_noise_pa**2, given.now_s)
-        if self._uses[1] and math.isfinite(air_c):
-            air_k = self._from_origin(1, air_c)
-            self._take(Sensor.THERMOMETER, ((_AIR, 1.0),), air_k, config.thermometer_noise_k**2, given.now_s)
+        weather = (_AMBIENT, pressure_pa, config.barometer_noise_pa), (_AIR, air_c, config.thermometer_noise_k)
+        for n, (state, value, noise) in enumerate(weather):
+            if self._uses[n] and math.isfinite(value):
+                sensor = Sensor(Sensor.BAROMETER + n)
+                self._take(sensor, ((state, 1.0),), self._from_origin(n, value), noise**2, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
         if math.isfinite(given.laser_um):

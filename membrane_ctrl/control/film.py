@@ -134,11 +134,6 @@ class FilmMonitor:
             _Since(SINCE_HOURS_S, self._limits.laser_gauge_drift_max_um),
         )
 
-    @property
-    def watching(self) -> bool:
-        """Whether it has had readings since the last `reset`."""
-        return self._seen_s > 0.0
-
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
         """Process one tick and return both readings if they contradict each other. NaN without a good reading.
 

@@ -20,7 +20,6 @@ from membrane_ctrl.control.pump_drift import PumpScale
 #
 # The mean of dy/dt is a difference of two readings: the laser's noise falls with the window, not with its root.
 
-
 # Long compared with the loop (6.5 s), short compared with a leak that somebody opens.
 WINDOW_S = 60.0
 
@@ -37,13 +36,15 @@ TOO_TIGHT_END_UM_PER_S = 0.45
 # With a shorter mean, weather alone could cause the warning.
 JUDGE_S = 30.0
 
+# A reading so far from its filtered value is a jump of film or laser: no gas moves the film so fast.
+JUMP_UM = 10.0
+
 
 class LeakEstimate:
     """Mean loss of gas (leak and bleed together) over the last minute, or over a shorter record."""
 
     def __init__(self) -> None:
-        self._mean_um_per_s = 0.0
-        self._elapsed_s = 0.0
+        self._mean_um_per_s = self._elapsed_s = 0.0
         self._last_um = math.nan
         self._warned = False
 
@@ -59,14 +60,18 @@ class LeakEstimate:
             self._warned = self._mean_um_per_s < (TOO_TIGHT_END_UM_PER_S if self._warned else TOO_TIGHT_UM_PER_S)
         return self._warned
 
-    def update(self, flow_um_per_s: float, feedforward_um_per_s: float, filtered_um: float, dt_s: float) -> None:
-        """Take one step into the mean."""
-        if math.isfinite(self._last_um):
-            speed_um_per_s = (filtered_um - self._last_um) / dt_s
-            self._elapsed_s = min(self._elapsed_s + dt_s, WINDOW_S)
-            loss_um_per_s = flow_um_per_s - feedforward_um_per_s - speed_um_per_s
-            self._mean_um_per_s += dt_s / self._elapsed_s * (loss_um_per_s - self._mean_um_per_s)
-        self._last_um = filtered_um
+    def update(self, pumped_um_per_s: float, displacement_um: float, filtered_um: float, dt_s: float) -> None:
+        """Take a step: the flow without the feed-forward's share, and the reading, as read and filtered."""
+        jumps = abs(displacement_um - filtered_um) > JUMP_UM
+        if math.isfinite(self._last_um) and not jumps:
+            self.take(pumped_um_per_s - (filtered_um - self._last_um) / dt_s, filtered_um, dt_s)
+        self._last_um = displacement_um if jumps else filtered_um  # where the filter will be
+
+    def take(self, loss_um_per_s: float, centre_um: float, dt_s: float) -> None:
+        """Take a step's loss that is known, and where it ends."""
+        self._elapsed_s = min(self._elapsed_s + dt_s, WINDOW_S)
+        self._mean_um_per_s += dt_s / self._elapsed_s * (loss_um_per_s - self._mean_um_per_s)
+        self._last_um = centre_um
 
     def pause(self) -> None:
         """Skip a step without a reading."""
@@ -187,8 +192,7 @@ class PumpHealth:
 
     def __init__(self, change_max: float) -> None:
         self._change_max = change_max
-        self._count = 0
-        self._warned = False
+        self._count, self._warned = 0, False
 
     def set_pump(self, change_max: float) -> None:
         """Another curve is in force, with this limit of its drift."""

@@ -146,14 +146,18 @@ class InnerLoop:
             self.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
         else:
             self._drift.spoil()
-        self._leak.update(self._flow(fraction), weather_um_per_s, filtered_um, dt_s)
+        if given.estimate is None:
+            self._leak.update(self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s)
+        else:
+            self._leak.take(given.estimate.leak_um_per_s, filtered_um, dt_s)
         return self._output(terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
 
     def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
         before_um = self._measured.value
         filtered_um = self._measured.update(given.displacement_um, dt_s)
-        error_um, ramp_um_per_s = self._follow_setpoint(given, filtered_um, dt_s)
+        shaped_um, ramp_um_per_s = self._shape_setpoint(given, filtered_um, dt_s)
+        error_um = self._matched.update(shaped_um, dt_s) - filtered_um
         rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
@@ -207,7 +211,8 @@ class InnerLoop:
         self._spoil()
         fraction = self._command(placed_um_per_s, dt_s)
         if seen:
-            self._leak.update(self._flow(fraction), weather_um_per_s, self._measured.value, dt_s)
+            pumped_um_per_s = self._flow(fraction) - weather_um_per_s
+            self._leak.update(pumped_um_per_s, given.displacement_um, self._measured.value, dt_s)
         else:
             self._leak.pause()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
@@ -271,11 +276,6 @@ class InnerLoop:
         self._setpoint_um = self._shaped_um = setpoint_um
         self._weight.reset(setpoint_um)
         self._matched.reset(setpoint_um)
-
-    def _follow_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
-        """Advance the setpoint; return the loop's error in um and the ramp's own speed in um/s."""
-        shaped_um, speed_um_per_s = self._shape_setpoint(given, filtered_um, dt_s)
-        return self._matched.update(shaped_um, dt_s) - filtered_um, speed_um_per_s
 
     def _shape_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
         """Advance the setpoint; return it as the loop sees it, and its speed in um/s."""

@@ -98,7 +98,7 @@ class SensorConsistency:
         if state in safety.CONNECTED:
             apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
             self.laser_gauge_apart = apart.replace("laser", "optics") if self._by_optics else apart
-        elif self._film.watching:
+        else:
             self._film.reset()
             self.laser_gauge_apart = ""
         if state != State.HOLD or abs(held.ramp_left_um) > self._far_um:
@@ -141,8 +141,7 @@ class SensorConsistency:
         self._lies_s, self.laser_moved = 0.0, False
         self._growth.moves()
         self.gas_excess = ""
-        if self._plausibility.watching:
-            self._plausibility.reset()
+        self._plausibility.reset()
         return self._judge(film.Liar.NOBODY)
 
     def _look_at_camera(self, inputs: TickInputs) -> None:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 
 from membrane_ctrl.control import inner_loop
+from membrane_ctrl.control.centre_estimate import Sensor
 from membrane_ctrl.control.experiments.machine import BenchSample, Finished
 from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
@@ -339,9 +340,11 @@ def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
     by_optics = scene.config.by_optics
     if scene.levels.safe_level == SafeLevel.HOLD_FLOW:
         return f"holding the last mean flow until the {'optics see the film' if by_optics else 'laser is back'}"
+    alone = scene.estimate is not None and not scene.estimate.sensors[Sensor.LASER].fresh
+    holding = "holding by the optics alone" if alone else "holding"
     if output.too_tight:
-        return "holding, but the mirror is too tight: open a bleed (loop.bleed_fraction)"
+        return f"{holding}, but the mirror is too tight: open a bleed (loop.bleed_fraction)"
     if output.saturated:
         side = "more than the pump has" if output.flow_wanted_um_per_s > output.flow_um_per_s else "less than none"
-        return f"holding, pump at its limit: the loop needs {side}"
-    return "holding: the pump balances the leak"
+        return f"{holding}, pump at its limit: the loop needs {side}"
+    return f"{holding}: the pump balances the leak"

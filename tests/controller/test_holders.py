@@ -13,7 +13,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.events import Fault, HeldBy
+from membrane_ctrl.model.events import Fault, HeldBy, Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
@@ -79,6 +79,10 @@ def test_a_lost_sensor_makes_no_bump_and_no_fault(fail: Callable[[Wrong, bool], 
     assert moved_um(ticks) < 0.3
     assert not [event for tick in ticks for event in tick.events if isinstance(event, Fault)]
     assert told(ticks) == holders
+    alone = [
+        event for tick in ticks for event in tick.events if isinstance(event, Why) and "optics alone" in event.why
+    ]
+    assert len(alone) == sum("laser" not in sensors for sensors in holders)
     assert ticks[-1].row.state == State.HOLD
 
 

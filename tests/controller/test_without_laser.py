@@ -38,6 +38,7 @@ BY_ALL = Config(
     estimator=EstimatorConfig(process_value="estimate"), twin=TwinConfig(start_error_um=-1.0, scenario="quiet")
 )
 BY_TRACKS = BY_ALL.model_copy(update={"shape": ShapeConfig(mode="track")})
+BY_LASER = Config(twin=BY_ALL.twin)
 NOTHING: Callable[[Wrong, float], None] = lambda wrong, now_s: None  # noqa: E731
 
 
@@ -315,6 +316,7 @@ def _judge_knock(um: float, until_s: float) -> None:
     assert liars == ["laser", "nobody"]
     assert ticks[-1].row.laser_innovation == pytest.approx(0.0, abs=5.0)  # it is used again
     assert told(ticks, ShapeLoopState)[-1].state == "tracking"
+    assert min(tick.row.leak_um_per_s for tick in ticks if tick.row.mono_s > 38.0) > 1.0  # no gas went anywhere
 
 
 def test_a_knocked_laser_is_told_once_and_the_optics_hold_on() -> None:
@@ -372,6 +374,17 @@ def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) 
 def test_a_jump_of_any_size_is_brought_back(seed: int, seen: bool) -> None:
     rng = np.random.default_rng(seed)
     _judge_jump(float(np.exp(rng.uniform(math.log(15.0), math.log(50.0))) * rng.choice([-1.0, 1.0])), seen)
+
+
+@pytest.mark.parametrize("config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"])
+def test_a_jump_that_the_camera_missed_is_no_leak(config: Config) -> None:
+    """Before the usual consumption is known, a jump upwards must not make the later one look like a seam."""
+    config = config.model_copy(update={"loop": LoopConfig(rate_hz=10.0)})
+    ticks = held(180.0, _blind(40.0), config, AmbientChange(JUMP_S, 40.0 / -0.358, 0.1), shape_s=0.2)
+    assert [event.liar for event in told(ticks, Plausibility)] == ["optics"]
+    assert not told(ticks, Fault)
+    leaks_um_per_s = [tick.row.leak_um_per_s for tick in ticks[600:]]
+    assert 1.0 < min(leaks_um_per_s) < max(leaks_um_per_s) < 1.4
 
 
 # A stand that grows.
