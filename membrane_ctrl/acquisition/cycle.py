@@ -151,9 +151,6 @@ class ShapeCycle:
         return replace(estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle)
 
 
-# The laser's displacement during a frame's exposure, from the control process's telemetry.
-
-
 # One reading has 1 um of noise, ten times the held centre's motion between frames: a frame gets the mean of the
 # readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 um), symmetric in time so that a steady motion
 # cancels; in these 0.4 s the held centre moves less than the remaining noise.
@@ -275,9 +272,6 @@ def _tell(
             remote.report("running", verdict, cycle=estimate.cycle)
         case CycleFailed(number, stage, message, pause_s):
             remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
-
-
-# The geometry of live cycles: its origin, and whether it still fits the cycles.
 
 
 def geometry_event(geometry: InForce) -> run_events.GeometryInForce:

@@ -14,9 +14,6 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.phase import full_sequence
 from membrane_ctrl.metrology.track.live import crossed_patterns
 
-# Before the first cycle, the camera measures exposure, checkerboard, settle time and response of the display.
-
-
 # Longer than any suitable display takes
 LONG_S = 0.5
 # Frame after frame for this long, three times per direction, as refresh and exposure are not synchronised

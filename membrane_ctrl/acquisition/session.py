@@ -14,15 +14,12 @@ from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, 
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
-from membrane_ctrl.metrology.track.live import LiveTracker
-from membrane_ctrl.metrology.track.modes import Stethoscope
+from membrane_ctrl.metrology.track.live import LiveTracker, Stethoscope
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.plant import Truth
-
-# The twin's film, screen and camera, as the acquisition sees them.
 
 
 class TwinTruth:
@@ -152,7 +149,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
-        drift, heard = cycle.LiveDrift(geometry, config.shape.bin_px), Stethoscope()
+        drift, heard = cycle.LiveDrift(geometry, config.shape.bin_px), Stethoscope(config.pump.stroke_hz)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot

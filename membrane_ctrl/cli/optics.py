@@ -65,9 +65,9 @@ def track(
     json: JsonOption = False,
 ) -> int:
     """Track the figure through the frames of one crossed pattern: a figure for every frame."""
-    from membrane_ctrl.measure.track import TrackOptions, track_command
+    from membrane_ctrl.measure.track import track_command
 
-    return track_command(TrackOptions(capture_set, geometry, out, json, pictures))
+    return track_command(capture_set, geometry, out, json, pictures)
 
 
 def modes(
@@ -79,9 +79,9 @@ def modes(
     json: JsonOption = False,
 ) -> int:
     """Find the mirror's vibrations in tracked figures: frequency, amplitude and shape; whether one moves."""
-    from membrane_ctrl.review.statistics.modes_run import ModesOptions, modes_command
+    from membrane_ctrl.review.statistics.modes_run import modes_command
 
-    return modes_command(ModesOptions(tuple(folders), out, json, pictures))
+    return modes_command(folders, out, json, pictures)
 
 
 def export_figure(

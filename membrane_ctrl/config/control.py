@@ -84,6 +84,9 @@ class PumpConfig(Section):
     Set it to half the centre's standard deviation: 0.1 gives 5 % after three hours at 1 um of laser noise."""
     change_max: Annotated[float, Field(gt=0, le=1)] = 0.12
     """Drift of the pump from its curve that causes the notice `pump_drift`. Raise it for a pump that varies."""
+    stroke_hz: Annotated[float, Field(ge=0, le=100)] = 0.0
+    """Strokes a second in a usual hold; one that tracks tells when they meet a vibration of the mirror. 0: unknown.
+    Set it for a diaphragm pump."""
 
     @model_validator(mode="before")
     @classmethod

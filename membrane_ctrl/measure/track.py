@@ -23,7 +23,7 @@ from membrane_ctrl.measure.results import write_arrays, write_figure
 from membrane_ctrl.metrology.full import BinFigure, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, separable
 from membrane_ctrl.metrology.track.scene import scene_of
-from membrane_ctrl.metrology.track.tracked import TrackedFrame
+from membrane_ctrl.metrology.track.tracked import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
@@ -69,17 +69,6 @@ class TrackFile(Section):
 
 
 @dataclass(frozen=True)
-class TrackOptions:
-    """Options of the command."""
-
-    folder: Path
-    geometry: Path | None = None
-    out: Path | None = None
-    as_json: bool = False
-    pictures: bool = True
-
-
-@dataclass(frozen=True)
 class Track:
     """What a tracking set gave."""
 
@@ -94,22 +83,21 @@ class Track:
         return {name: np.array([getattr(frame, name) for frame in self.frames]) for name in (*numbers, *words)}
 
 
-def track_command(options: TrackOptions) -> int:
+def track_command(folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool) -> int:
     """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
-    folder = options.folder
     begin = time.perf_counter()
-    track = track_set(folder, None if options.geometry is None else read_geometry(options.geometry))
+    track = track_set(folder, None if geometry is None else read_geometry(geometry))
     passed_s = time.perf_counter() - begin
-    out = options.out.resolve() if options.out else folder / "result"
+    out = out.resolve() if out else folder / "result"
     table = _table(track)
     with errors.writing(out):
         files.make_folder(out)
         write_arrays(out / "track.npz", **track.columns())
-        if options.pictures:
+        if pictures:
             _show(out, track, _lines(table))
     rate = len(track.frames) / passed_s
     print(f"written to {out}; {rate:.1f} frames/s with reading them", file=sys.stderr)
-    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
     return int(errors.Exit.DONE if table["usable"] else errors.Exit.REJECTED)
 
 
@@ -140,7 +128,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     for k, picture in enumerate(rest, start=len(found)):
         at_s, reading = float(times[k]), float(readings[k])
         if isinstance(picture, str):
-            found.append(tracker.missed(at_s, picture))
+            found.append(rejected_frame(at_s, picture))
         else:
             found.append(tracker.follow(picture, (shifts[k, 0], shifts[k, 1]), at_s, reading))
     return Track(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -19,12 +18,8 @@ from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
 from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld
+from tests.support.tracked_errors import CLEAN, MOVING, SIZE, TrackedErrors, errors_of, rms
 
-CLEAN = {
-    "drift_um_per_s": 0.0, "swing_um": 0.0, "shimmer_um": 0.0, "brightness": 0.0, "ambient_adu": 0.0, "bend": 0.0,
-    "dim_per_s": 0.0, "dust": 0, "air_um": 0.0,
-}  # fmt: skip
-MOVING = {"swing_um": 0.3, "shimmer_um": 0.1, "drift_um_per_s": 0.002}
 EFFECTS: dict[str, dict[str, float]] = {
     "still": {},
     "hardly any noise": {"noise_adu": 0.05},  # what repeats from frame to frame shows
@@ -36,52 +31,25 @@ EFFECTS: dict[str, dict[str, float]] = {
     "dimming": {"dim_per_s": 1e-4},
     "dust": {"dust": 20},
     "seeing": {"air_um": 0.1},
+    "pulsed backlight": {"backlight_hz": 1923.0},
+    "pulsed backlight, rolling shutter": {"backlight_hz": 1923.0, "rolling_s": 0.02},
+    "pictures that stick": {"sticking": 0.02, "sticking_s": 60.0},
+    "vibrations": {"drum_nm": 5.0},
     "all": {**MOVING, "brightness": 0.005, "ambient_adu": 2.0, "bend": 0.04, "dust": 20, "air_um": 0.1},
 }
 FRAME_S = 0.43
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Errors of frames (m,) against the figure that `measure` gives of the reference, in their own sigmas."""
-
-    sag: Array
-    terms: Array  # (m, 35): Noll 2 to 36
-    verdicts: set[str]
-
-
-def errors_of(folder: Path, effect: str, seed: int, frames: int, step_every_s: float) -> Errors:
-    """Make a reference and a tracking set, run both commands, compare."""
-    world = CrossedWorld(width=245, height=205, pixel_um=34.5, seed=seed, **CLEAN | EFFECTS[effect])  # type: ignore[arg-type]
-    world.write_reference(folder / "full")
-    world.write_track(folder / "track", 0.5 + FRAME_S * np.arange(frames), step_every_s)
-    assert run(["measure", str(folder / "full"), "--no-pictures"]) == 0
-    assert run(["track", str(folder / "track"), "--no-pictures"]) == 0
-    result, details = (
-        json.loads((folder / f"full/result/{name}.json").read_text()) for name in ("result", "details")
-    )
-    found = np.load(folder / "track/result/track.npz")
-    sag_um = np.array([world.sag_um(t) - world.sag_um(0.0) for t in found["time_s"]])
-    sag = (found["sag_um"] - 1e3 * details["sag_mm"] - sag_um) / found["sag_sigma_um"]
-    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.95, 0.95, 41)] * 2))
-    inside = np.hypot(x, y) <= 0.95
-    x, y = x[inside], y[inside]
-    columns = zernike.values(x, y).T
-    before_um = world.height_um(0.0, RADIUS_MM * x, RADIUS_MM * y)
-    moved_um = np.array([world.height_um(t, RADIUS_MM * x, RADIUS_MM * y) - before_um for t in found["time_s"]])
-    true_um = np.linalg.lstsq(columns, moved_um.T, rcond=None)[0].T
-    error_um = found["coeffs_um"] - np.array(result["zernike"]["coeffs_um"]) - true_um
-    return Errors(sag, (error_um / found["sigma_um"])[:, 1:], set(found["verdict"].tolist()))
-
-
-def rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def judged(folder: Path, effect: str, seed: int, frames: int, step_every_s: float) -> TrackedErrors:
+    """The errors of an effect alone."""
+    world = CrossedWorld(seed=seed, **SIZE | CLEAN | EFFECTS[effect])  # type: ignore[arg-type]
+    return errors_of(world, folder, 0.5 + FRAME_S * np.arange(frames), step_every_s)
 
 
 @pytest.mark.parametrize("effect", ["hardly any noise", "all"])
 def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
-    found = errors_of(tmp_path, effect, seed=1, frames=30, step_every_s=2.0)
-    assert found.verdicts == {"ok"}
+    found = judged(tmp_path, effect, seed=1, frames=30, step_every_s=2.0)
+    assert found.ok_share == 1
     assert 0.6 < rms(found.terms) < 1.5
     assert rms(found.sag) < 2.0
 
@@ -89,13 +57,13 @@ def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_each_effect_alone(tmp_path: Path, effect: str, capsys: pytest.CaptureFixture[str]) -> None:
-    seeds = [errors_of(tmp_path / str(seed), effect, seed, frames=120, step_every_s=10.0) for seed in (1, 2, 3)]
+    seeds = [judged(tmp_path / str(seed), effect, seed, frames=120, step_every_s=10.0) for seed in (1, 2, 3)]
     sag, terms = np.concatenate([one.sag for one in seeds]), np.concatenate([one.terms for one in seeds])
     worst = np.sqrt(np.mean(np.square(terms), axis=0)).max()
     with capsys.disabled():
         print(f"\n{effect}: sag {rms(sag):.2f}, terms {rms(terms):.2f}, worst {worst:.2f}, ", end="")
         print(f"largest {np.abs(terms).max():.1f} sigma")
-    assert set.union(*[one.verdicts for one in seeds]) == {"ok"}
+    assert {one.ok_share for one in seeds} == {1.0}
     assert 0.7 < rms(terms) < 1.3
     assert 0.5 < rms(sag) < 1.6
 
@@ -138,7 +106,7 @@ def light_of(world: CrossedWorld) -> Array:
 
 def cramer_rao_um(noise_adu: float) -> Array:
     """Least 1 sigma (35,) of Noll terms 2 to 36 in um, with maps of level and both contrasts unknown as well."""
-    setup = CLEAN | {"width": 245, "height": 205, "pixel_um": 34.5}
+    setup = CLEAN | SIZE
     seen = light_of(BentWorld(**setup))  # type: ignore[arg-type]
     columns = []
     for term in range(2, 37):
@@ -157,7 +125,7 @@ def cramer_rao_um(noise_adu: float) -> Array:
 def test_noise_is_near_the_cramer_rao_bound(
     tmp_path: Path, noise_adu: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    still = CLEAN | {"noise_adu": noise_adu, "width": 245, "height": 205, "pixel_um": 34.5}
+    still = CLEAN | SIZE | {"noise_adu": noise_adu}
     world = CrossedWorld(seed=5, **still)  # type: ignore[arg-type]
     world.write_reference(tmp_path / "full")
     world.write_track(tmp_path / "track", FRAME_S * np.arange(1, 66), step_every_s=math.inf)
@@ -175,7 +143,7 @@ def test_jumps_lose_no_order_silently(
     tmp_path: Path, most_um: float, most_mrad: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The frame after a jump is refused, or right within its bar; whatever the laser says, which is not there."""
-    setup = CLEAN | {"width": 245, "height": 205, "pixel_um": 34.5}
+    setup = CLEAN | SIZE
     still = BentWorld(**setup)  # type: ignore[arg-type]
     still.write_reference(tmp_path / "full")
     reference = Figures().of(tmp_path / "full")

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.metrology import phase
 from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.track.live import LOST_S, REJECTED_S, LiveTracker
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.track.live import LOST_S, REJECTED_S, LiveTracker, Stethoscope
+from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.film_shape import typical_film
+from membrane_ctrl.sim.optics.film_shape import DRUM_MODES, typical_film
 from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.plant import Plant
+from tests.support.virtual_record import run_virtual
 
 SHRINK = 8
 OPTICS = OpticsConfig(camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK))
@@ -147,6 +152,37 @@ def test_the_dark_asks_for_a_full_cycle_only_after_a_while(bench: Bench) -> None
     assert {e.reason.split(":")[0] for e in dark} == {"dark"}
     assert dark[-1].tracking_lost
     assert not any(e.tracking_lost for e in dark[:-2])
+
+
+def held_um(seconds: float) -> NDArray[np.float64]:
+    """Displacement of a held mirror at 50 Hz, once it has settled."""
+    config = Config()
+    plant = Plant(config.twin, config.pump)
+    ticks = run_virtual(config, plant, 240.0 + seconds, zernike_projection())
+    moved_um = np.array([plant.truth().displacement_um for _ in ticks])
+    return moved_um[round(240.0 * config.loop.rate_hz) :] - moved_um[-1]
+
+
+@pytest.mark.campaign
+def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
+    """Two minutes of the twin's film, as a hold moves it, vibrating by 20 nm at each of a drum's frequencies."""
+    optics = OPTICS.model_copy(update={"camera": OPTICS.camera.model_copy(update={"bits": 12, "noise_adu": 1.0})})
+    tracker = LiveTracker(optics, LiveReconstructor(optics, 1), 32, step_s=10.0)
+    modes = tuple(replace(mode, amplitude_nm=20.0) for mode in DRUM_MODES)
+    renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
+    film_um, listener, told = held_um(126.0), Stethoscope(), []
+    still = [renderer.render(p, float(film_um[0])) for p in phase.full_sequence(optics.pattern)]
+    assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
+    time_s = 2.0
+    while time_s < 125.0:
+        picture = renderer.render(tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s)
+        told += listener.after(tracker.fringes([picture], np.array([time_s]), np.array([math.nan])))
+        time_s += tracker.slower / 20
+    assert len(told) == 2
+    for heard in told:
+        assert isinstance(heard, Vibrations)
+        assert sorted(filter(None, heard.frequency_hz)) == pytest.approx([27, 48, 57, 61], abs=0.02)
+        assert [nm for nm in heard.amplitude_nm if nm] == pytest.approx([20.0] * 4, rel=0.15)
 
 
 def test_without_an_anchor_a_frame_is_rejected() -> None:

@@ -54,7 +54,7 @@ def test_a_mode_that_moves_within_a_week_is_told(
         )
     monkeypatch.setattr(modes_run, "is_run", lambda folder: True)
     monkeypatch.setattr(modes_run, "open_run", runs.__getitem__)
-    assert modes_run.modes_command(modes_run.ModesOptions(tuple(runs), tmp_path / "out", pictures=False)) == 0
+    assert modes_run.modes_command(tuple(runs), tmp_path / "out", as_json=False, pictures=False) == 0
     said = capsys.readouterr().out
     assert "it moved by -1.5%: the film's tension by -3.0%" in said
     assert said.count("mode  ") == 1

@@ -1,8 +1,9 @@
 """A second world of crossed fringes: rays, film, panel, light and air share no code with the product.
 
 Film: a height function of its own, moving with time; rays by fixed-point steps, normals by differences of the height.
-Panel: a response that is not straight, brightness that wanders in space and time, dimming. Room: ambient light with a
-slope. Air: waves that bend the rays. Stand: grows along the camera's axis. Dust: spots that move now and then.
+Panel: a response that is not straight, brightness that wanders in space and time, dimming, a pulsed backlight,
+pictures that stick. Room: ambient light with a slope. Air: waves that bend the rays. Stand: grows along the camera's
+axis. Dust: spots that move now and then. The film may vibrate, and the camera's shutter may roll.
 """
 
 from __future__ import annotations
@@ -16,11 +17,27 @@ import cv2
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
+from scipy import ndimage, special
 
 Array = NDArray[np.float64]
 PERIODS, PERIOD_MM, CROSSED = 8, 49.82, 32
 SIDE_MM = PERIODS * PERIOD_MM
 RADIUS_MM = 500.0
+# Vibrations: frequency, lobes and circles of each
+DRUM = ((27.13, 1, 1), (48.21, 2, 1), (57.37, 0, 1), (61.09, 0, 2))
+EXPOSURE_S, DUTY = 0.02, 0.7
+
+
+def _bessel(lobes: int, circles: int) -> Array:
+    """Coefficients of J_m(z r) / r^m as a polynomial of r^2, z the zero at the rim; unit RMS times cos(m theta)."""
+    zero = special.jn_zeros(lobes, circles)[-1]
+    rms = abs(special.jv(lobes + 1, zero)) * (math.sqrt(0.5) if lobes else 1.0)
+    series = [(-1) ** k * (zero / 2) ** (2 * k + lobes) / (special.factorial(k) * special.factorial(k + lobes))
+              for k in range(14)]  # fmt: skip
+    return np.array(series[::-1]) / rms
+
+
+_BESSEL = [_bessel(lobes, circles) for _, lobes, circles in DRUM]
 
 
 @dataclass
@@ -30,24 +47,31 @@ class Waves:
     rms: float
     length_mm: float
     memory_s: float
+    reach_mm: float  # from the middle: the field is that of the nearest edge beyond
     seed: int
     count: int = 40
     _time_s: float = 0.0
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
-        self._k = self._random.normal(0, 2 * math.pi / self.length_mm / 2, (self.count, 2))
+        k = self._random.normal(0, 2 * math.pi / self.length_mm / 2, (self.count, 2))
         self._amplitude = self._random.normal(size=(2, self.count))
+        self._nodes_mm, self._step_mm = np.linspace(
+            -self.reach_mm, self.reach_mm, 1 + math.ceil(20 * self.reach_mm / self.length_mm), retstep=True
+        )
+        x, y = np.meshgrid(self._nodes_mm, self._nodes_mm)
+        angle = np.multiply.outer(k[:, 0], x) + np.multiply.outer(k[:, 1], y)
+        self._waves = np.stack([np.cos(angle), np.sin(angle)])
 
     def at(self, time_s: float, x: Array, y: Array) -> Array:
+        """The field at places (mm), by cubic splines between nodes a tenth of its length apart."""
         keep = math.exp(-abs(time_s - self._time_s) / self.memory_s)
         fresh = self._random.normal(size=(2, self.count))
         self._amplitude = keep * self._amplitude + math.sqrt(1 - keep**2) * fresh
         self._time_s = time_s
-        angle = np.multiply.outer(self._k[:, 0], x) + np.multiply.outer(self._k[:, 1], y)
-        cosine, sine = self._amplitude
-        field = np.tensordot(cosine, np.cos(angle), 1) + np.tensordot(sine, np.sin(angle), 1)
-        return np.asarray(self.rms / math.sqrt(self.count) * field)
+        nodes = self.rms / math.sqrt(self.count) * np.tensordot(self._amplitude, self._waves, 2)
+        places = [(place + self.reach_mm) / self._step_mm for place in (y, x)]
+        return np.asarray(ndimage.map_coordinates(nodes, places, order=3, mode="nearest"))
 
 
 @dataclass
@@ -73,51 +97,76 @@ class CrossedWorld:
     dust: int = 20
     air_um: float = 0.1  # on the screen
     kelvin: float = 0.0  # swing of the stand's temperature
+    backlight_hz: float = 0.0  # of its pulses; 0 is steady
+    rolling_s: float = 0.0  # from the first row to the last
+    sticking: float = 0.0  # light that is lost where the panel has always been bright
+    sticking_s: float = 3600.0
+    drum_nm: float = 0.0  # RMS amplitude of each vibration
+    bits: int = 8
     seed: int = 1
     _light: Waves = field(init=False)
     _air: tuple[Waves, Waves] = field(init=False)
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
-        self._light = Waves(self.brightness, 75.0, 60.0, self.seed + 1)
-        self._air = (Waves(self.air_um, 400.0, 0.5, self.seed + 2), Waves(self.air_um, 400.0, 0.5, self.seed + 3))
+        self._light = Waves(self.brightness, 75.0, 60.0, SIDE_MM / 2, self.seed + 1)
+        self._air = (
+            Waves(self.air_um, 400.0, 0.5, RADIUS_MM, self.seed + 2),
+            Waves(self.air_um, 400.0, 0.5, RADIUS_MM, self.seed + 3),
+        )
+        self._height = np.zeros((0, 0))  # of the rays' places, of the last frame
+        self._burnt, self._shown_s = np.zeros(2, complex), 0.0
+        self._dust = np.ones((0, 0))
         self._phase = self._random.uniform(0, 2 * math.pi, 4)
         self._spots = self._random.uniform(-0.9, 0.9, (self.dust, 2)) * RADIUS_MM
 
-    def sag_um(self, t: float) -> float:
-        return 1e3 * self.sag_mm + self.drift_um_per_s * t + self.swing_um * math.sin(0.7 * t + self._phase[0])
+    def sag_um(self, t: Any) -> Any:
+        """Without the vibrations."""
+        return 1e3 * self.sag_mm + self.drift_um_per_s * t + self.swing_um * np.sin(0.7 * t + self._phase[0])
 
-    def film_mm(self, x: Array, y: Array, t: float) -> Array:
-        """Height above the vertex."""
+    def film_mm(self, x: Array, y: Array, t: Any) -> Array:
+        """Height above the vertex of the film without vibrations, and these; `t` is one time or that of each row."""
         u, v = x / RADIUS_MM, y / RADIUS_MM
         q = u * u + v * v
         bowl = q * (1.075 - 0.06 * q - 0.015 * q * q)
-        wave = 1e-3 * self.shimmer_um * np.sin(np.array([1.3, 2.1, 0.9]) * t + self._phase[1:])
-        out = 1e-3 * self.sag_um(t) * bowl + (0.25 + wave[0]) * (u * u - v * v) + (0.1 + wave[1]) * 2 * u * v
-        return np.asarray(out + (0.05 + wave[2]) * u * (3 * q - 2) + 0.004 * np.cos(3.0 * u + 5.0 * v))
+        swing = [
+            1e-3 * self.shimmer_um * np.sin(w * t + p) for w, p in zip((1.3, 2.1, 0.9), self._phase[1:], strict=True)
+        ]
+        out = 1e-3 * self.sag_um(t) * bowl + (0.25 + swing[0]) * (u * u - v * v) + (0.1 + swing[1]) * 2 * u * v
+        out = out + (0.05 + swing[2]) * u * (3 * q - 2) + 0.004 * np.cos(3.0 * u + 5.0 * v)
+        for k, (hz, lobes, _) in enumerate(DRUM if self.drum_nm else ()):
+            part = np.polyval(_BESSEL[k], q) * (1.0, u, u * u - v * v)[lobes]
+            out = out + 1e-6 * self.drum_nm * np.sin(2 * math.pi * hz * t + k) * part
+        return np.asarray(out)
 
-    def vertex_z_mm(self, t: float) -> float:
+    def vertex_z_mm(self, t: Any) -> Any:
         """The ring rests: the vertex sinks as the bowl deepens."""
         return (1e3 * self.sag_mm - self.sag_um(t)) * 1e-3
 
     def kelvin_at(self, t: float) -> float:
         return self.kelvin * math.sin(2 * math.pi * t / 1200.0)
 
-    def trace(self, t: float) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-        """Screen coordinates, place on the mirror and whether it is inside the rim, of every pixel."""
+    def trace(self, t: Any) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+        """Screen coordinates, place on the mirror and whether it is inside the rim, of every pixel.
+
+        `t` is one time, or that of each row, (height, 1).
+        """
+        now = float(np.mean(t))
         alpha = math.radians(self.alpha_deg)
-        pinhole = (self.a_mm + 0.060 * self.kelvin_at(t)) * np.array([math.cos(alpha), 0.0, math.sin(alpha)])
+        pinhole = (self.a_mm + 0.060 * self.kelvin_at(now)) * np.array([math.cos(alpha), 0.0, math.sin(alpha)])
         forward = -np.array([math.cos(alpha), 0.0, math.sin(alpha)])
         right, down = np.array([math.sin(alpha), 0.0, -math.cos(alpha)]), np.array([0.0, -1.0, 0.0])
         row, column = np.mgrid[: self.height, : self.width].astype(float)
         scale = self.pixel_um * 1e-3 / self.focal_mm
         across, along = (column - (self.width - 1) / 2) * scale, (row - (self.height - 1) / 2) * scale
         ray = forward + across[..., None] * right + along[..., None] * down
-        low, h = self.vertex_z_mm(t), np.zeros(row.shape)
-        for _ in range(8):
+        known = self._height.shape == row.shape
+        low, h = self.vertex_z_mm(t), self._height if known else np.zeros(row.shape)
+        for _ in range(3 if known else 8):  # the height's error shrinks to a thirtieth
             reach = (low + h - pinhole[2]) / ray[..., 2]
             x, y = pinhole[0] + reach * ray[..., 0], pinhole[1] + reach * ray[..., 1]
             h = np.where(np.hypot(x, y) < 1.05 * RADIUS_MM, self.film_mm(x, y, t), h)
+        self._height = h
         e = 0.25
         slope_x = (self.film_mm(x + e, y, t) - self.film_mm(x - e, y, t)) / (2 * e)
         slope_y = (self.film_mm(x, y + e, t) - self.film_mm(x, y - e, t)) / (2 * e)
@@ -131,38 +180,57 @@ class CrossedWorld:
         hit = place + far[..., None] * back - origin
         s_x, s_y = hit @ np.array([-math.sin(alpha), 0.0, -math.cos(alpha)]), hit @ np.array([0.0, 1.0, 0.0])
         if self.air_um:
-            s_x = s_x + 1e-3 * self._air[0].at(t, x, y)
-            s_y = s_y + 1e-3 * self._air[1].at(t, x, y)
+            s_x = s_x + 1e-3 * self._air[0].at(now, x, y)
+            s_y = s_y + 1e-3 * self._air[1].at(now, x, y)
         return s_x, s_y, x, y, np.hypot(x, y) <= RADIUS_MM
 
-    def frame(self, t: float, pattern: Any, gain: float = 1.0) -> NDArray[np.uint8]:
+    def frame(self, t: float, pattern: Any, gain: float = 1.0) -> NDArray[Any]:
         """What the camera sees of a pattern, a function of s_x and s_y from the low edge that gives 0 to 1."""
-        s_x, s_y, x, y, inside = self.trace(t)
+        rows = t + self.rolling_s * np.linspace(-0.5, 0.5, self.height)[:, None] if self.rolling_s else t
+        s_x, s_y, x, y, inside = self.trace(rows)
         level = np.clip(pattern(s_x + SIDE_MM / 2, s_y + SIDE_MM / 2), 0, 1)
         lit = level + self.bend * np.sin(math.pi * level) ** 2
         if self.brightness:
             lit = lit * (1 + self._light.at(t, s_x, s_y))
         shown = np.maximum(np.abs(s_x), np.abs(s_y)) < SIDE_MM / 2
         lit = np.where(shown, 0.02 + 0.98 * lit * (1 - self.dim_per_s * t), 0.02)
-        for spot_x, spot_y in self._spots:
-            lit = lit * (1 - 0.6 * np.exp(-((x - spot_x) ** 2 + (y - spot_y) ** 2) / (2 * 6.0**2)))
+        if self._dust.shape != x.shape:
+            self._dust = np.ones(x.shape)
+            for spot_x, spot_y in self._spots:
+                self._dust *= 1 - 0.6 * np.exp(-((x - spot_x) ** 2 + (y - spot_y) ** 2) / (2 * 6.0**2))
+        lit = lit * self._dust * self._backlight(rows)
         room = self.ambient_adu * (1 + 0.3 * x / RADIUS_MM + 0.2 * math.sin(0.05 * t))
         corner = 1 - 0.1 * (x**2 + y**2) / RADIUS_MM**2
         counts = 5 + np.where(inside, room + 190 * gain * lit * corner, 0.0)
-        return np.clip(np.rint(counts + self._random.normal(0, self.noise_adu, counts.shape)), 0, 255).astype(
-            np.uint8
-        )
+        counts += self._random.normal(0, self.noise_adu, counts.shape)
+        full = 2**self.bits - 1
+        return np.rint(counts * full / 255).clip(0, full).astype(np.uint8 if self.bits == 8 else np.uint16)
+
+    def _backlight(self, t: Any) -> Any:
+        """Light of an exposure whose middle is `t`, over the mean."""
+        if not self.backlight_hz:
+            return 1.0
+        begin, end = (self.backlight_hz * (t + side * EXPOSURE_S / 2) for side in (-1, 1))
+        lit = [np.floor(turns) * DUTY + np.minimum(turns - np.floor(turns), DUTY) for turns in (begin, end)]
+        return (lit[1] - lit[0]) / (DUTY * self.backlight_hz * EXPOSURE_S)
 
     def move_dust(self) -> None:
         self._spots = self._random.uniform(-0.9, 0.9, (self.dust, 2)) * RADIUS_MM
+        self._dust = np.ones((0, 0))
 
-    def crossed(self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0) -> NDArray[np.uint8]:
-        """A frame of the crossed pattern."""
+    def crossed(self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0) -> NDArray[Any]:
+        """A frame of the crossed pattern, which has been shown since the frame before."""
         rate = 2 * math.pi * CROSSED / SIDE_MM
+        keep = math.exp(-(t - self._shown_s) / self.sticking_s)
+        self._burnt, self._shown_s = keep * self._burnt + (1 - keep) * np.exp([1j * shift_x, 1j * shift_y]), t
 
         def pattern(s_x: Array, s_y: Array) -> Array:
-            waves = np.cos(rate * s_x - math.pi + shift_x) + np.cos(rate * s_y - math.pi + shift_y)
-            return np.asarray(0.5 + waves / 4)
+            turns = [rate * s - math.pi for s in (s_x, s_y)]
+            shown = 0.5 + (np.cos(turns[0] + shift_x) + np.cos(turns[1] + shift_y)) / 4
+            if self.sticking:
+                stuck = [np.real(b * np.exp(1j * turn)) for b, turn in zip(self._burnt, turns, strict=True)]
+                shown = shown * (1 - self.sticking * (0.5 + (stuck[0] + stuck[1]) / 4))
+            return np.asarray(shown)
 
         return self.frame(t, pattern, gain)
 
@@ -181,7 +249,7 @@ class CrossedWorld:
         table["geometry"] = {"a_mm": self.a_mm, "b_mm": self.b_mm, "alpha_deg": self.alpha_deg}
         table["camera"] = {
             "width_px": self.width, "height_px": self.height, "focal_mm": self.focal_mm, "pixel_um": self.pixel_um,
-            "noise_adu": self.noise_adu,
+            "noise_adu": self.noise_adu * (2**self.bits - 1) / 255, "bits": self.bits,
         }  # fmt: skip
         table["mirror"] = {"radius_mm": RADIUS_MM, "analysis_radius_mm": 475.0}
         table["frames"] = rows

@@ -13,6 +13,16 @@ from membrane_ctrl.metrology.track.modes import VibrationMode
 
 FloatArray = NDArray[np.float64]
 THREE_RATES = (20.0, 18.4, 17.1)
+# Noll terms without lobes, on the rim and at the vertex
+RIM = {1: 1.0, 4: math.sqrt(3), 11: math.sqrt(5), 22: math.sqrt(7)}
+VERTEX = {1: 1.0, 4: -math.sqrt(3), 11: math.sqrt(5), 22: -math.sqrt(7)}
+# A drum's first vibrations, as far as 36 terms go
+DRUM = {
+    27.0: {4: -0.552, 11: 0.059},
+    48.0: {2: 0.738, 8: -0.663, 16: 0.126},
+    57.0: {6: 0.693, 12: -0.694, 24: 0.204},
+    61.0: {4: -0.491, 11: 0.739, 22: -0.276},
+}
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,21 @@ def frame_times_s(rates_hz: tuple[float, ...], seconds: float) -> FloatArray:
     return np.concatenate(out)
 
 
+def at_rest(terms: FloatArray) -> FloatArray:
+    """A vibration's terms (36,), unit RMS with the ring at rest."""
+    out = terms.copy()
+    out[0] = -sum(height * terms[j - 1] for j, height in RIM.items() if j > 1)
+    return out / np.linalg.norm(out)
+
+
+def drum(frequency_hz: float) -> FloatArray:
+    """A drum's vibration (36,)."""
+    out = np.zeros(36)
+    for j, part in DRUM[frequency_hz].items():
+        out[j - 1] = part
+    return at_rest(out)
+
+
 def watched(
     seed: int,
     lines_hz: tuple[float, ...] = (27.0, 48.0, 57.0, 61.0),
@@ -44,16 +69,22 @@ def watched(
     seconds: float = 60.0,
     noise_nm: float = 12.0,
     quality: float = math.inf,
+    amplitude_nm: float = 5.0,
+    drums: bool = False,
 ) -> tuple[FloatArray, FloatArray, list[Planted]]:
-    """Times, terms in um and what was planted: 5 nm each, in noise that terms share, on terms that drift."""
+    """Times, terms in um and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
+
+    Frequencies and shapes are drawn, unless they are a drum's.
+    """
     rng = np.random.default_rng(seed)
     t = frame_times_s(rates_hz, seconds)
     mixed = np.linalg.qr(rng.normal(size=(36, 36)))[0]
     terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed + np.cumsum(rng.normal(size=(t.size, 36)), axis=0)
     planted = []
     for line_hz in lines_hz:
-        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), rng.normal(size=36)
-        shape /= np.linalg.norm(shape)
+        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), at_rest(rng.normal(size=36))
+        if drums:
+            frequency_hz, shape = line_hz, drum(line_hz)
         planted.append(Planted(frequency_hz, shape))
         if math.isinf(quality):
             wave = np.cos(2 * math.pi * frequency_hz * t + rng.uniform(0, 6))
@@ -63,5 +94,6 @@ def watched(
             pushed = rng.normal(size=(round((t[-1] - t[0]) / step_s) + 2, 2)) @ [1, 1j]
             ringing = lfilter([1], [1, -pole], pushed).real
             wave = np.interp(t - t[0], np.arange(ringing.size) * step_s, ringing / ringing.std() * math.sqrt(0.5))
-        terms_nm += 5.0 * np.outer(wave, shape)
+        terms_nm += amplitude_nm * np.outer(wave, shape)
+    terms_nm[:, 0] = -sum(height * terms_nm[:, j - 1] for j, height in VERTEX.items() if j > 1)
     return t, terms_nm * 1e-3, planted

@@ -26,6 +26,9 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
 _MAX_STEPS = 10
 _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
+# Largest last change of a frame that is not lost: at the rim, where it is ten times that of the terms. Steps shrink
+# slowly where Tukey's weights of many bins change with them.
+_SETTLED_MM = 1e-5
 _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
 _LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivatives: nanometres off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
@@ -140,7 +143,7 @@ class FrameFitter:
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)
             if self._inverse is None and matrices < _MAX_MATRICES:
-                self._inverse = self._inverted(shifts_rad, shape)
+                self._inverse = self._inverted(shifts_rad, shape, light, self._out[6])
                 matrices, change = matrices + 1, math.inf  # its first step is not judged by an old one's last
             if self._inverse is None:
                 break
@@ -150,23 +153,16 @@ class FrameFitter:
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
             if not TOLERANCE_MM < change < _ASTRAY_MM:
                 break
-            if change > _SLOW * last:
+            if change > _SLOW * last and matrices < _MAX_MATRICES:
                 self._inverse = None
         residual, weights = self._out[5].copy(), self._out[6].copy()
-        return FrameFit(shape, light, residual, weights, change <= TOLERANCE_MM)
+        return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM)
 
     def _evaluate(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        moved = shape.parameters - self._traced.parameters
-        if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
-            self._traced, moved = shape, np.zeros(PARAMETERS)
-            self._base = _reduced(self.scene.phase_rad(shape))
-        turn = moved.astype(np.float32) @ self.jacobian
-        np.matmul(light.astype(np.float32), self.scene.basis, out=self._maps)
-        self._maps += 1
-        self._maps *= self._light_adu
+        turn = self._turned(shape, light)
 
         def run(start: int, stop: int) -> None:
             fixed = (self._base, turn, np.array(shifts_rad, np.float32), self._maps, self.scene.response)
@@ -174,16 +170,27 @@ class FrameFitter:
 
         split(run, self.scene.index.size)
 
+    def _turned(self, shape: Surface, light: FloatArray) -> Singles:
+        """Phases (2, n) of a surface beyond those of the one that was traced last; the maps follow the light."""
+        moved = shape.parameters - self._traced.parameters
+        if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
+            self._traced, moved = shape, np.zeros(PARAMETERS)
+            self._base = _reduced(self.scene.phase_rad(shape))
+        np.matmul(light.astype(np.float32), self.scene.basis, out=self._maps)
+        self._maps += 1
+        self._maps *= self._light_adu
+        return np.asarray(moved.astype(np.float32) @ self.jacobian)
+
     def _right(self) -> FloatArray:
         """J^T W r (144,) of the last evaluation."""
         of_surface = self.jacobian[0] @ self._out[0] + self.jacobian[1] @ self._out[1]
         of_light = (self._out[2:5] * self._light_adu) @ self.scene.basis.T
         return np.concatenate([of_surface, of_light.ravel()]).astype(float)
 
-    def _columns(self, shifts_rad: tuple[float, float], shape: Surface) -> Singles:
+    def _columns(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
         """J (144, n)."""
-        moved = (shape.parameters - self._traced.parameters).astype(np.float32)
-        x, y = self._base + moved @ self.jacobian + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
+        turn = self._turned(shape, light)  # may trace anew
+        x, y = self._base + turn + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         swing_x, swing_y = self._maps[1], self._maps[2]
         level, first, second = self._light_adu
         out = np.empty((_UNKNOWNS, self.scene.index.size), np.float32)
@@ -203,10 +210,12 @@ class FrameFitter:
         twice = sum(2 * c * (v**k - v) for k, c in bent)
         return np.asarray(slope, np.float32), np.asarray(twice, np.float32)
 
-    def _inverted(self, shifts_rad: tuple[float, float], shape: Surface) -> FloatArray | None:
+    def _inverted(
+        self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, weights: Singles
+    ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
-        columns = self._columns(shifts_rad, shape)
-        matrix = ((columns * self._out[6]) @ columns.T).astype(float)
+        columns = self._columns(shifts_rad, shape, light)
+        matrix = ((columns * weights) @ columns.T).astype(float)
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not kernels.invert(matrix):
@@ -220,10 +229,12 @@ class FrameFitter:
         the solution counts as one error, and the squares as independent. Maps of light are refitted with the surface,
         so that their errors are in it.
         """
+        if self._inverse is None:  # the last frame was refused
+            self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
-        pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface)
+        pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface, fit.light)
         pull *= fit.weights * fit.residual_adu
         blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
         sums = np.stack([np.bincount(blocks, row) for row in pull])

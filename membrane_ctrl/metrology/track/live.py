@@ -6,6 +6,7 @@ leaves of them, and the covariance stays the same for many frames.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, checked, full, live, phase
 from membrane_ctrl.metrology.frames import evidence, frame_stack
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS
+from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, MOVED, SEARCH_S, VibrationMode, find_modes
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracked import TrackedFrame
 from membrane_ctrl.metrology.track.tracker import Tracker
+from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
@@ -28,6 +31,8 @@ REJECTED_S = 10.0
 # The interval between frames is longer in two of three steps: vibrations faster than half the frame rate then have
 # different aliases (`modes`).
 _SLOWER = (1.0, 1.09, 1.17)
+MODES = 8  # that a hold follows
+_SEARCHES = 5  # whose median is a mode's frequency
 _UM, _SHARE, _TIME_S = 3, 4, 6  # decimals: a nanometre, a hundredth of a per cent, a microsecond
 
 
@@ -167,3 +172,106 @@ def _estimate(found: TrackedFrame, reading_um: float, tracking_lost: bool, urad:
         reason=found.reason,
         tracking_lost=tracking_lost,
     )
+
+
+class Stethoscope:
+    """The mirror's vibrations while it is held, searched in each minute of tracked figures.
+
+    The first eight modes are followed. One that moves by 1 % from its first searches tells of another tension; one
+    within 1 % of `stroke_hz`, the pump's strokes (0: unknown), is driven by them.
+    """
+
+    def __init__(self, stroke_hz: float = 0.0) -> None:
+        self._time_s: list[float] = []
+        self._terms_um: list[FloatArray] = []
+        self._modes: list[_Heard] = []
+        self._stroke_hz = stroke_hz
+        self._said: set[str] = set()
+
+    def after(self, estimate: ShapeEstimate) -> list[events.Event]:
+        """Take a figure; once a minute, say what was heard, if ever there was something."""
+        if estimate.kind != "track" or estimate.verdict == "rejected":
+            return []
+        self._time_s.append(estimate.time_s)
+        self._terms_um.append(estimate.coeffs_um)
+        if estimate.time_s - self._time_s[0] < SEARCH_S:
+            return []
+        time_s, terms_um = np.array(self._time_s), np.array(self._terms_um)
+        self._time_s, self._terms_um = [], []
+        return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
+
+    def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
+        """Search a minute of terms (n, 36) at times (n,); a line of several possible frequencies is not told."""
+        found = find_modes(time_s, terms_um)
+        if found is None:
+            return []
+        for mode in self._modes:
+            mode.line = None
+        for line in (line for line in found if not line.aliases_hz):
+            known = next((mode for mode in self._modes if mode.line is None and line.is_like(mode.last)), None)
+            if known is None and len(self._modes) < MODES:
+                self._modes.append(known := _Heard(line))
+            if known is not None:
+                known.add(line)
+        if not self._modes:
+            return []
+        lines = [mode.line for mode in self._modes]
+        told = ", ".join(f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line)
+        heard = run_events.Vibrations(
+            [None if line is None else round(line.frequency_hz, 4) for line in lines],
+            [None if line is None else round(line.amplitude_nm, 2) for line in lines],
+            told or "none",
+        )
+        return [heard, *self._tension(), *self._strokes()]
+
+    def _tension(self) -> list[events.Event]:
+        """A notice when the first mode has moved, and when all are back."""
+        limit = MOVED / 2 if "film_tension" in self._said else MOVED
+        moved = next((mode for mode in self._modes if abs(mode.moved) > limit), None)
+        says = "" if moved is None else (
+            f"the mirror's vibration at {moved.usual_hz:.2f} Hz moved by {moved.moved:+.1%}: the film's tension by "
+            f"{2 * moved.moved:+.1%}; check clamping and pressure"
+        )  # fmt: skip
+        return self._notice("film_tension", says, "the mirror's vibrations are where they were")
+
+    def _strokes(self) -> list[events.Event]:
+        """A notice when the pump's strokes meet a mode, and when none is there any more."""
+        near_hz = MOVED * self._stroke_hz
+        lines = [mode.line for mode in self._modes if mode.line is not None]
+        driven = next((line for line in lines if abs(line.frequency_hz - self._stroke_hz) < near_hz), None)
+        says = "" if driven is None else (
+            f"the pump's strokes, {self._stroke_hz:g} Hz, drive the mirror's vibration at {driven.frequency_hz:.2f} "
+            f"Hz, {driven.amplitude_nm:.0f} nm; change the pump's speed or its mount"
+        )  # fmt: skip
+        return self._notice("pump_resonance", says, "no vibration of the mirror is at the pump's strokes")
+
+    def _notice(self, name: str, says: str, over: str) -> list[events.Event]:
+        """What is new of a matter: that it begins, or that it is over."""
+        if bool(says) == (name in self._said):
+            return []
+        self._said ^= {name}
+        return [events.Maintenance(name, says) if says else events.MaintenanceOver(name, over)]
+
+
+@dataclass
+class _Heard:
+    """A mode over the searches."""
+
+    last: VibrationMode
+    line: VibrationMode | None = None  # of the last search; None where it was not heard
+    all_hz: list[float] = field(default_factory=list)
+
+    def add(self, line: VibrationMode) -> None:
+        """Take its line of a search."""
+        self.line = self.last = line
+        self.all_hz.append(line.frequency_hz)
+
+    @property
+    def usual_hz(self) -> float:
+        """Frequency of the first searches."""
+        return float(np.median(self.all_hz[:_SEARCHES]))
+
+    @property
+    def moved(self) -> float:
+        """Relative change since, once there are enough searches."""
+        return float(np.median(self.all_hz[-_SEARCHES:])) / self.usual_hz - 1

@@ -13,16 +13,14 @@ search goes on with what is left. T is also the logarithm of the likelihood (Bre
 curvature is the frequency's variance, and frequencies with a T nearly as large are named as equally possible.
 """
 
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
-from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 ComplexArray = NDArray[np.complex128]
 
@@ -38,6 +36,7 @@ _CHANCE = 1e-9  # of a false line in one search
 _ALIKE = 10.0  # difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
 _LEAKED = 0.1  # of T: what a line leaves where its alias is as slow as drift, and another frequency takes for itself
 _MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
+_MARGIN = 1.5  # of T at one rate: errors of the noise's spectrum are the same in all pieces
 _APART_HZ = 0.3  # closer ones are one line
 _SAME = 0.004  # relative: two searches see one mode, whatever the shapes
 _FAR, _SIMILAR = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
@@ -45,8 +44,6 @@ _FAR, _SIMILAR = 0.05, 0.8  # relative, and correlation: two searches see one mo
 SEARCH_S = 60.0
 LEAST_RATE_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
 MOVED = 0.01  # relative: the film's tension has changed by 2 %
-MODES = 8  # that a hold follows
-_SEARCHES = 5  # whose median is a mode's frequency
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class VibrationMode:
 
     frequency_hz: float
     sigma_hz: float
-    amplitude_nm: float  # of the oscillation, RMS over the mirror
+    amplitude_nm: float  # of the oscillation, RMS over the mirror, whose ring rests
     shape: FloatArray  # (36,): terms, unit RMS; the largest is positive
     evidence: float  # T less that of noise
     # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
@@ -72,52 +69,64 @@ class _Piece:
     """Some seconds of frames."""
 
     time_s: FloatArray  # (n,)
+    rate_hz: float
     window: FloatArray  # (n,)
     waves: ComplexArray  # (frequencies, n)
     alias_hz: FloatArray  # (frequencies,): their aliases below half its frame rate
     blind: BoolArray  # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
 
     def projected(self, terms_um: FloatArray) -> ComplexArray:
-        """X (frequencies, 36) of terms (n, 36)."""
+        """X (frequencies, 35) of terms (n, 35)."""
         return np.asarray(self.waves @ (self.window[:, None] * terms_um))
 
     def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
-        """The terms without oscillations about a frequency that `shapes` (36, 36) projects on; others stay."""
+        """The terms without oscillations about a frequency that `shapes` (35, 35) projects on; others stay."""
         times = 2 * np.pi * (self.time_s - self.time_s[0])
         phases = [(frequency_hz + offset / PIECE_S) * times for offset in _TAKEN]
         base = np.column_stack([wave(phase) for phase in phases for wave in (np.cos, np.sin)])
         return np.asarray(terms_um - base @ np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0])
 
 
-def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0) -> tuple[VibrationMode, ...]:
+def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0) -> tuple[VibrationMode, ...] | None:
     """Vibrations in terms (n, 36) of frames at times (n,), NaN where a frame was rejected; the strongest first.
 
-    Raises ValueError if there are less than 20 s of frames.
+    None if there are less than 20 s of frames at a steady rate.
     """
     good = np.isfinite(coeffs_um).all(axis=1)
     grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
-    pieces, terms = _pieces(time_s[good], coeffs_um[good], grid_hz)
+    # the first term only puts the vertex at 0: it would weigh what moves the vertex twice
+    pieces, terms = _pieces(time_s[good], coeffs_um[good, 1:], grid_hz)
     if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
-        raise ValueError(f"less than {LEAST_S:g} s of frames at a steady rate")
+        return None
     found: list[VibrationMode] = []
-    spectra = [piece.projected(own) for piece, own in zip(pieces, terms, strict=True)]
+    margin = _MARGIN if _one_rate([piece.rate_hz for piece in pieces]) else 1.0
     for _ in range(_MOST):
+        spectra = [piece.projected(part) for piece, part in zip(pieces, terms, strict=True)]
         seen = _evidence(spectra, pieces)
-        if seen.max() < _threshold(seen, grid_hz.size):
+        if seen.max() < margin * _threshold(seen, grid_hz.size):
             break
         k, rivals = _likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
         frequency, sigma = _refined(seen, grid_hz, k)
-        amplitude_nm, shape = _shape([spectrum[k] for spectrum in spectra], pieces)
-        sigma = max(sigma, _scatter_hz([np.abs(spectrum @ shape) ** 2 for spectrum in spectra], grid_hz, k))
+        used = [p for p, piece in enumerate(pieces) if not piece.blind[k]]  # others have drift there
+        amplitude_nm, shape = _shape([spectra[p][k] for p in used], [pieces[p] for p in used])
+        own = shape[1:] / np.linalg.norm(shape[1:])
+        sigma = max(sigma, _scatter_hz([np.abs(spectra[p] @ own) ** 2 for p in used], grid_hz, k))
         again = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
         if not again:
             evidence = float(seen[k] - np.median(seen))
-            aliases = tuple(float(grid_hz[j]) for j in rivals)
+            rates_hz = [pieces[p].rate_hz for p in used]
+            aliases = _aliases_hz(rates_hz, frequency, most_hz) or tuple(grid_hz[rivals].tolist())
             found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
-        taken = np.eye(shape.size) if again else np.outer(shape, shape)
-        terms = [piece.without(own, frequency, taken) for piece, own in zip(pieces, terms, strict=True)]
-        spectra = [piece.projected(own) for piece, own in zip(pieces, terms, strict=True)]
-    return tuple(found)
+        taken = np.eye(own.size) if again else np.outer(own, own)
+        terms = [piece.without(part, frequency, taken) for piece, part in zip(pieces, terms, strict=True)]
+    return tuple(_sole(mode, found) for mode in found)
+
+
+def _sole(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:
+    """The mode without aliases that are themselves modes: they stood out when it was gone."""
+    others_hz = np.array([other.frequency_hz for other in found])
+    kept = (alias for alias in mode.aliases_hz if np.abs(others_hz - alias).min() > _APART_HZ)
+    return replace(mode, aliases_hz=tuple(kept))
 
 
 def _pieces(time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray) -> tuple[list[_Piece], list[FloatArray]]:
@@ -131,7 +140,7 @@ def _pieces(time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray) -> t
         window = np.cos(np.pi / 2 * (t - middle) / half) ** 2
         waves = np.exp(-2j * np.pi * grid_hz[:, None] * (t - t[0]))
         blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
-        pieces.append(_Piece(t, window, waves, alias_hz, blind))
+        pieces.append(_Piece(t, rate_hz, window, waves, alias_hz, blind))
         terms.append(_without_drift(t, coeffs_um[frames]))
     return pieces, terms
 
@@ -201,7 +210,9 @@ def _threshold(seen: FloatArray, frequencies: int) -> float:
     """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of these quantiles."""
     from scipy import stats
 
-    low, middle = np.quantile(seen, [0.1, 0.5])  # of the lower half, where neither lines nor their aliases are
+    heard = seen[seen > 0]  # to the others all pieces are blind
+    # of the lower half, where neither lines nor their aliases are
+    low, middle = np.quantile(heard, [0.1, 0.5]) if heard.size else (0.0, 0.0)
     if not middle > low:
         return float("inf")  # nothing moves at all
     order = max((1.2816 * middle / (middle - low)) ** 2, 1.0)
@@ -225,6 +236,20 @@ def _likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
     return likeliest, sorted(k for k in alike if k != likeliest and seen[k] > most - _ALIKE)
 
 
+def _one_rate(rates_hz: list[float]) -> bool:
+    return max(rates_hz) < 1.03 * min(rates_hz)
+
+
+def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> tuple[float, ...]:
+    """All aliases of a frequency that pieces of one rate alone show: others may be blind to the true one."""
+    if not _one_rate(rates_hz):
+        return ()
+    rate_hz = float(np.mean(rates_hz))
+    alias_hz = abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
+    every = {abs(m * rate_hz + sign * alias_hz) for m in range(int(most_hz / rate_hz) + 1) for sign in (-1, 1)}
+    return tuple(sorted(f for f in every if _LEAST_HZ < f < most_hz and abs(f - frequency_hz) > _APART_HZ))
+
+
 def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
     """Frequency and its standard deviation from the parabola through three values of T."""
     step = grid_hz[1] - grid_hz[0]
@@ -239,12 +264,16 @@ def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, floa
 
 
 def _shape(lines: list[ComplexArray], pieces: list[_Piece]) -> tuple[float, FloatArray]:
-    """Amplitude in nm and terms of unit RMS from X (36,) of each piece at the line: all its terms are in phase."""
+    """Amplitude in nm and terms (36,) of unit RMS with the ring at rest, from X (35,) of each piece at the line.
+
+    All terms are in phase.
+    """
     waves = np.array([2 * line / piece.window.sum() for line, piece in zip(lines, pieces, strict=True)])
-    together = np.real(waves.conj().T @ waves)
-    shape = np.linalg.eigh(together)[1][:, -1]
-    shape = shape * np.sign(shape[np.argmax(np.abs(shape))])
-    return float(1e3 * np.sqrt(np.mean(np.abs(waves @ shape) ** 2))), np.asarray(shape)
+    terms = np.linalg.eigh(np.real(waves.conj().T @ waves))[1][:, -1]
+    shape = np.append(-terms @ zernike.at_rim()[1:], terms)
+    size = float(np.linalg.norm(shape))
+    shape *= np.sign(shape[np.argmax(np.abs(shape))]) / size
+    return float(1e3 * size * np.sqrt(np.mean(np.abs(waves @ terms) ** 2))), np.asarray(shape)
 
 
 def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
@@ -252,99 +281,4 @@ def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
     reach = round(_APART_HZ * _GRID * PIECE_S)
     first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
     own = [_refined(line, grid_hz, first + int(np.argmax(line[first:last])))[0] for line in lines]
-    return float(np.std(own, ddof=1) / np.sqrt(len(own)))
-
-
-class Stethoscope:
-    """The mirror's vibrations while it is held, searched in each minute of tracked figures.
-
-    The first eight modes are followed. One that moves by 1 % from its first searches tells of another tension.
-    """
-
-    def __init__(self) -> None:
-        self._time_s: list[float] = []
-        self._terms_um: list[FloatArray] = []
-        self._modes: list[_Heard] = []
-        self._moved = False
-
-    def after(self, estimate: ShapeEstimate) -> list[events.Event]:
-        """Take a figure; once a minute, say what was heard, if ever there was something."""
-        if estimate.kind != "track" or estimate.verdict == "rejected":
-            return []
-        self._time_s.append(estimate.time_s)
-        self._terms_um.append(estimate.coeffs_um)
-        if estimate.time_s - self._time_s[0] < SEARCH_S:
-            return []
-        time_s, terms_um = np.array(self._time_s), np.array(self._terms_um)
-        self._time_s, self._terms_um = [], []
-        return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
-
-    def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
-        """Search a minute of terms (n, 36) at times (n,); a line of several possible frequencies is not told."""
-        try:
-            found = [line for line in find_modes(time_s, terms_um) if not line.aliases_hz]
-        except ValueError:  # too many gaps
-            return []
-        for mode in self._modes:
-            mode.line = None
-        for line in found:
-            known = next((mode for mode in self._modes if mode.line is None and line.is_like(mode.last)), None)
-            if known is not None:
-                known.add(line)
-            elif len(self._modes) < MODES:
-                self._modes.append(_Heard(line))
-        if not self._modes:
-            return []
-        lines = [mode.line for mode in self._modes]
-        told = ", ".join(f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line)
-        heard = run_events.Vibrations(
-            [None if line is None else round(line.frequency_hz, 4) for line in lines],
-            [None if line is None else round(line.amplitude_nm, 2) for line in lines],
-            told or "none",
-        )
-        return [heard, *self._notices()]
-
-    def _notices(self) -> list[events.Event]:
-        """A notice when the first mode has moved, and when all are back."""
-        moved = [mode for mode in self._modes if abs(mode.moved) > (MOVED / 2 if self._moved else MOVED)]
-        if bool(moved) == self._moved:
-            return []
-        self._moved = not self._moved
-        if not moved:
-            return [events.MaintenanceOver("film_tension", "the mirror's vibrations are where they were")]
-        change, before_hz = moved[0].moved, moved[0].usual_hz
-        return [
-            events.Maintenance(
-                "film_tension",
-                f"the mirror's vibration at {before_hz:.2f} Hz moved by {change:+.1%}: the film's tension by "
-                f"{2 * change:+.1%}; check clamping and pressure",
-            )
-        ]
-
-
-class _Heard:
-    """A mode over the searches."""
-
-    def __init__(self, line: VibrationMode) -> None:
-        self.line: VibrationMode | None = line  # of the last search; None where it was not heard
-        self.last = line
-        self._first_hz: list[float] = []
-        self._last_hz: deque[float] = deque(maxlen=_SEARCHES)
-        self.add(line)
-
-    def add(self, line: VibrationMode) -> None:
-        """Take its line of a search."""
-        self.line = self.last = line
-        self._last_hz.append(line.frequency_hz)
-        if len(self._first_hz) < _SEARCHES:
-            self._first_hz.append(line.frequency_hz)
-
-    @property
-    def usual_hz(self) -> float:
-        """Frequency of the first searches."""
-        return float(np.median(self._first_hz))
-
-    @property
-    def moved(self) -> float:
-        """Relative change since, once there are enough searches."""
-        return float(np.median(self._last_hz)) / self.usual_hz - 1 if len(self._last_hz) == _SEARCHES else 0.0
+    return float(np.std(own, ddof=1) / np.sqrt(len(own))) if len(own) > 1 else 0.0

@@ -106,19 +106,12 @@ class Finding:
 def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Finding]:
     """What the picture's light says before any fit."""
     share = float(np.mean(covered))
+    rejected, degraded = shape_estimate.SATURATED_REJECTED_FRACTION, shape_estimate.SATURATED_DEGRADED_FRACTION
     checks = (
-        (
-            saturated > shape_estimate.SATURATED_REJECTED_FRACTION,
-            "rejected",
-            f"saturated: {saturated:.0%} of the bins",
-        ),
+        (saturated > rejected, "rejected", f"saturated: {saturated:.0%} of the bins"),
         (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
         (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
-        (
-            saturated > shape_estimate.SATURATED_DEGRADED_FRACTION,
-            "degraded",
-            f"saturated: {saturated:.1%} of the bins",
-        ),
+        (saturated > degraded, "degraded", f"saturated: {saturated:.1%} of the bins"),
         (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
     )
     return [Finding(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]

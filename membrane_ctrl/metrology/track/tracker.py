@@ -23,7 +23,8 @@ _EXPOSURE = 0.03  # change of light from frame to frame that no panel makes
 _DIMMED = 0.9  # of the light at the anchor
 # What the fit leaves, over the swing of the fringes: noise, light and dust leave hundredths, a lost order 0.7
 _REST_REJECTED = 0.15
-_OUT_REJECTED = 0.1  # share of bins without weight
+_OUT_REJECTED = 0.1  # share of bins without weight and far off, over the swing: dust that moved is no lost order
+_FAR_OFF = 0.05
 _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
@@ -192,8 +193,9 @@ class Tracker:
         if rejected is not None:
             return tracked.rejected_frame(time_s, rejected.reason)
         fit = self._fitted(seen, shifts_rad, light, saturated | self._squares.bins(covered), displacement_um)
-        rest = self._scale_of(fit) / float(np.median(self._fitter.scene.light_adu[1])) / light
-        out = float(np.mean(fit.weights[~saturated & ~self._squares.bins(covered)] == 0))
+        swing_adu = float(np.median(self._fitter.scene.light_adu[1])) * light
+        rest, far = self._scale_of(fit) / swing_adu, np.abs(fit.residual_adu) > _FAR_OFF * swing_adu
+        out = float(np.mean((far & (fit.weights == 0))[~saturated & ~self._squares.bins(covered)]))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
         if doubt is not None and doubt.verdict == "rejected":
             return tracked.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
@@ -203,10 +205,6 @@ class Tracker:
             self._remember(shifts_rad, seen, fit)
         found = self._result(fit, shifts_rad, time_s, worst, rest)
         return replace(found, saturated_share=float(np.mean(saturated)))
-
-    def missed(self, time_s: float, reason: str) -> TrackedFrame:
-        """The result of a frame that could not be read."""
-        return tracked.rejected_frame(time_s, reason)
 
     def mean_residual_adu(self) -> FloatArray:
         """Light (rows, columns) that the fits left on average, over the bins; NaN outside the mirror."""

@@ -25,16 +25,6 @@ _FRAMES_MOST = 300_000  # of a set: four hours at 20 Hz
 
 
 @dataclass(frozen=True)
-class ModesOptions:
-    """Options of the command."""
-
-    folders: tuple[Path, ...]
-    out: Path | None = None
-    as_json: bool = False
-    pictures: bool = True
-
-
-@dataclass(frozen=True)
 class SeenMode:
     """A vibration in the searches that found it."""
 
@@ -70,28 +60,28 @@ class SeenMode:
         return np.array([line.sigma_hz for line in self.lines]) ** -2.0
 
 
-def modes_command(options: ModesOptions) -> int:
+def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pictures: bool) -> int:
     """Search the frames for vibrations, write `modes.json` and pictures, report. Raises CommandError."""
     times: list[float] = []
     searches: list[tuple[VibrationMode, ...] | None] = []
-    for folder in options.folders:
+    for folder in folders:
         time_s, coeffs_um, origin_s = _frames(folder)
         for part in terminal.counted(_minutes(time_s), "searches"):
             times.append(origin_s + float(time_s[part].mean()))
-            searches.append(_found(folder, time_s[part], coeffs_um[part]))
+            searches.append(find_modes(time_s[part], coeffs_um[part]))
     done = [(at_s, lines) for at_s, lines in zip(times, searches, strict=True) if lines is not None]
     if not done:
-        raise errors.RejectedError(f"{options.folders[0]}: less than {LEAST_S:g} s of frames at a steady rate")
+        raise errors.RejectedError(f"{folders[0]}: less than {LEAST_S:g} s of frames at a steady rate")
     modes, passing = _together(np.array([at_s for at_s, _ in done]), [lines for _, lines in done])
-    table = _table(options.folders, modes, passing, len(done))
-    out = (options.out or options.folders[-1] / "modes").resolve()
+    table = _table(folders, modes, passing, len(done))
+    out = (out or folders[-1] / "modes").resolve()
     with errors.writing(out):
         files.make_folder(out)
         write_json(out / "modes.json", table)
-        if options.pictures and modes:
+        if pictures and modes:
             _show(out, modes, min(times), _lines(table))
     print(f"written to {out}", file=sys.stderr)
-    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
     return 0
 
 
@@ -134,20 +124,12 @@ def _minutes(time_s: FloatArray) -> list[slice]:
     return [slice(edges[k], edges[k + 1]) for k in chosen]
 
 
-def _found(folder: Path, time_s: FloatArray, coeffs_um: FloatArray) -> tuple[VibrationMode, ...] | None:
-    """What a search finds; None if its frames have too many gaps."""
-    try:
-        return find_modes(time_s, coeffs_um)
-    except ValueError:
-        return None
-
-
 def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]) -> tuple[list[SeenMode], int]:
     """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how many others."""
     modes: list[SeenMode] = []
     seen = [(line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines]
     for line, at_s in sorted(seen, key=lambda each: each[0].frequency_hz):
-        near = (k for k, mode in enumerate(modes) if _is_one(mode, line, at_s))
+        near = (k for k, m in enumerate(modes) if at_s not in m.time_s.tolist() and line.is_like(m.lines[-1]))
         if (k := next(near, None)) is None:
             modes.append(SeenMode(np.array([at_s]), (line,)))
         else:
@@ -158,11 +140,6 @@ def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
         key=lambda mode: -sum(one.evidence for one in mode.lines),
     )
     return usual, len(seen) - sum(len(mode.lines) for mode in usual)
-
-
-def _is_one(mode: SeenMode, line: VibrationMode, at_s: float) -> bool:
-    """Whether a line is that mode in another search: nearly its frequency, or its shape somewhat beside it."""
-    return at_s not in mode.time_s.tolist() and line.is_like(mode.lines[-1])
 
 
 def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:
