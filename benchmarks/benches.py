@@ -12,6 +12,7 @@ import contextlib
 import io
 import json
 import math
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -39,6 +40,8 @@ SETTLE_S, HOLD_S = 120.0, 600.0
 GUSTY_HOLD_S = 3600.0  # ten minutes with gusts differ from ten others by a fifth, and up to 1.7 times
 LIMIT_UM = 10.0  # of the experiments: `tune run --limit-um`
 FRESH = 3  # benches of `make bench`, others every day
+OBEYED_MOST = 2  # refusals of a bench; what they ask for is done
+_ASKED = re.compile(r"loop\.bleed_fraction larger by (?P<bleed>[\d.]+)|--limit-um (?P<limit>[\d.]+)")
 SOUND = 1.2  # least ratio of full flow to leak of a bench that can be held
 
 
@@ -142,18 +145,33 @@ def least_std_um(bench: DrawnBench, weather_seed: int) -> float:
 
 
 def examined(bench: DrawnBench) -> dict[str, Any]:
-    """Figures of one bench; a refusal or an error is a figure as well."""
-    found: dict[str, Any] = asdict(bench) | {"least_um": least_std_um(bench, 3)}
-    config = bench.config()
+    """Figures of one bench; a refusal or an error is a figure as well. What a refusal asks for is done."""
+    found: dict[str, Any] = asdict(bench) | {"least_um": least_std_um(bench, 3), "obeyed": []}
+    config, limit_um = bench.config(), LIMIT_UM
     found |= _held("default", bench, config)
-    if "default_error" in found:
-        return found
+    while "default_error" not in found:
+        found |= _session(bench, config, limit_um)
+        asked = _ASKED.search(found.get("refused", ""))
+        if asked is None or len(found["obeyed"]) == OBEYED_MOST:
+            break
+        found["obeyed"].append(found.pop("refused"))
+        if asked["bleed"]:
+            opened = config.loop.bleed_fraction + float(asked["bleed"])
+            config = config.model_copy(update={"loop": config.loop.model_copy(update={"bleed_fraction": opened})})
+        else:
+            limit_um = float(asked["limit"])
+    return found
+
+
+def _session(bench: DrawnBench, config: Config, limit_um: float) -> dict[str, Any]:
+    """Figures of a whole session and, if gains were kept, of a hold with them."""
     hold: list[TwinHold] = []
 
     def opened(given: Config) -> TwinHold:
         hold.append(twin_hold_of(bench, given, 1))
         return hold[-1]
 
+    found: dict[str, Any] = {}
     with (
         tempfile.TemporaryDirectory() as folder,
         patch.object(opening, "TwinHold", opened),
@@ -162,7 +180,7 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
         told = io.StringIO()
         try:
             with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
-                found["exit"] = command.run_session(_options(config, Path(folder)))
+                found["exit"] = command.run_session(_options(config, Path(folder), limit_um))
         except CommandError as error:
             found |= {"exit": int(error.exit), "refused": "; ".join(error.lines)}
         except Exception as error:
@@ -177,10 +195,10 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     return found
 
 
-def _options(config: Config, logs: Path) -> TuneOptions:
+def _options(config: Config, logs: Path, limit_um: float) -> TuneOptions:
     return TuneOptions(
         config=config, twin=True, where=Where(), logs=logs, session=None, name="bench", author="benchmark",
-        reason="drawn bench", limit_um=LIMIT_UM, observe_s=session.OBSERVE_S, verify_s=600.0, take_over=False,
+        reason="drawn bench", limit_um=limit_um, observe_s=session.OBSERVE_S, verify_s=600.0, take_over=False,
         yes=True, choose="", json=False,
     )  # fmt: skip
 
@@ -229,17 +247,18 @@ def outcome(row: dict[str, Any]) -> str:
         return "crashed"
     if "default_error" in row:
         return "not held"
+    first = "refused, then " if row.get("obeyed") else ""
     if row.get("kept"):
-        return "kept"
-    return "rolled back" if "kept" in row else "refused"
+        return f"{first}kept"
+    return f"{first}rolled back" if "kept" in row else f"{first}refused"
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """The tables of docs/tuning.md."""
-    kept = [row for row in rows if outcome(row) == "kept"]
-    ratio = np.array([row["tuned_um"] / row["least_um"] for row in kept if "tuned_um" in row])
-    said = np.array([row["predicted_um"] / row["tuned_um"] for row in kept if "tuned_um" in row])
-    off = [(row["predicted_um"] - row["tuned_um"]) / row["predicted_sigma_um"] for row in kept if "tuned_um" in row]
+    kept = [row for row in rows if "tuned_um" in row]
+    ratio = np.array([row["tuned_um"] / row["least_um"] for row in kept])
+    said = np.array([row["predicted_um"] / row["tuned_um"] for row in kept])
+    off = [(row["predicted_um"] - row["tuned_um"]) / row["predicted_sigma_um"] for row in kept]
     default = np.array([row["default_um"] / row["least_um"] for row in rows if "default_um" in row])
     lines = ["| of the drawn benches | |", "|---|---|", f"| examined | {len(rows)} |"]
     words = [outcome(row) for row in rows]
@@ -257,7 +276,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     )
     lines += ["", "| bench | outcome | why |", "|---|---|---|"]
     for row in rows:
-        why = row.get("crashed") or row.get("default_error") or row.get("refused") or row.get("reason", "")
+        last = row.get("crashed") or row.get("default_error") or row.get("refused") or row.get("reason", "")
+        why = "; then: ".join([*row.get("obeyed", ()), last or "kept"])
         over = f"; excursion {row['excursion_um']:.1f} um" if row.get("excursion_um", 0) > LIMIT_UM else ""
         if outcome(row) != "kept" or over:
             lines.append(f"| {row['seed']}: {_short(row)} | {outcome(row)} | {why}{over} |")
@@ -291,6 +311,7 @@ def main() -> None:
     """Examine what is missing in the file, then print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--benches", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--file", type=Path, default=DEFAULT_FILE)
     given = parser.parse_args()
@@ -298,7 +319,7 @@ def main() -> None:
     rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
     known = {row["seed"] for row in rows}
     with Pool(given.processes) as pool, given.file.open("a", encoding="utf-8") as file:
-        for row in pool.imap_unordered(_one, [seed for seed in range(given.benches) if seed not in known]):
+        for row in pool.imap_unordered(_one, sorted({*range(given.first, given.first + given.benches)} - known)):
             rows.append(row)
             file.write(json.dumps(row) + "\n")
             file.flush()

@@ -117,12 +117,12 @@ class SurveyedPump:
 
 
 def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
-    """Hold the bench with cautious gains, and survey its pump."""
+    """Hold the bench with the default gains, then with cautious ones, and survey its pump."""
     plant = pump.plant()
     link = TwinHold(second_world.foreign_config(rate_hz=RATE_HZ), bench=second_world.foreign_bench(plant))
     rig = HoldRig(link, "benchmark")
-    rig.set_gains(rig.loop.model_copy(update=pump_trial._CAUTIOUS), "pump map", 3600.0)
     rig.hold(SETTLED_S)
+    rig.set_gains(rig.loop.model_copy(update=pump_trial._CAUTIOUS), "pump map", 3600.0)
     before, made = len(link.rows), list[PumpSurvey]()
 
     def survey(*given: float) -> PumpSurvey:

@@ -1,5 +1,6 @@
 """The measured curve of the pump on trial: measured, applied, checked by steps of the flow, kept or taken back."""
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +19,7 @@ _MAP_S = 3600.0
 # Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer;
 # behind a slow ramp an actuator several times as strong as configured does not carry the mirror past the setpoint.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
+_SLOW, _SLOWER = 0.5, 0.25  # K times how late the actuator is; SIMC with that as time constant has 0.5
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
 _AT_ONCE_S = 1.5  # a round that begins at its limit is over
 _BEFORE_S = 20.0  # whose mean flow about holds the mirror
@@ -78,21 +80,23 @@ def map_pump(
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     _returned(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
-    curve = gas.PumpCurve(rig.pump)
-    holding = curve.fraction(around.holding_flow_um_per_s)
+    holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     held = True
     while held and (steps := survey.steps()):
-        flow_um_per_s = (
-            curve.flow(survey.holding) or around.holding_flow_um_per_s
-        )  # none, on a curve far from the true
-        around = replace(around, holding_flow_um_per_s=flow_um_per_s)
+        if flow_um_per_s := gas.PumpCurve(rig.pump).flow(survey.holding):  # none, on a curve far from the true
+            around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         run = run_of(rows, rig.dt_s)
         survey.take(run, finished.completed)
         if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
+        with contextlib.suppress(ValueError):  # none yet
+            found = survey.result()
+            if gas.PumpCurve(found.pump).least_flow_um_per_s < found.leak_um_per_s:  # it holds the mirror
+                loop = _freed(*rig.good, found.pump).model_copy(update=_CAUTIOUS)
+                rig.set_gains(_slowed(loop, found, _SLOWER), "pump map", _MAP_S, pump=found.pump)
         # a hold that swings may do; one that stays away ends every round at once
         held = _returned(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
     return survey.result(held)
@@ -113,8 +117,12 @@ def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig
     margins = loop_model.margins(loop_model.Gains.of(loop), model, 1 / loop.rate_hz)
     if margins.stable and margins.ms <= MS_MAX:
         return loop
+    return _slowed(loop, found, _SLOW)
+
+
+def _slowed(loop: schema.LoopConfig, found: pump_map.PumpMap, share: float) -> schema.LoopConfig:
     late_s = found.delay_s + found.lag_s + loop.measurement_filter_s + 0.5 / loop.rate_hz
-    return loop.model_copy(update={"kp_per_s": 0.5 / late_s, "ti_s": 8 * late_s, "td_s": 0.0})
+    return loop.model_copy(update={"kp_per_s": share / late_s, "ti_s": 4 * late_s / share, "td_s": 0.0})
 
 
 def _checked(rig: HoldRig) -> tuple[float, float]:

@@ -57,13 +57,6 @@ class Rig:
         """Run an experiment about 0 until it finishes; the loop can hold afterwards."""
         return self._run(trial.Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
 
-    def run(
-        self, experiment: machine.Experiment, around: machine.Around, centre_um: float
-    ) -> tuple[Record, machine.Finished]:
-        """Run a custom experiment inside the guard."""
-        guard = machine.ExcursionGuard(experiment, around, centre_um, 1 / self.dt_s)
-        return self._run(guard, around.holding_flow_um_per_s)
-
     def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
         samples: list[machine.BenchSample] = []

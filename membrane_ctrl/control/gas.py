@@ -24,6 +24,8 @@ STALL_MARGIN = 0.005
 # A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 um.
 KICK_S = 0.1
 
+VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
+
 _PER_INTERVAL = 16  # chords of the cubic between two points: within 0.1 % of its rise
 
 

@@ -16,7 +16,6 @@ Severity = Literal["error", "warning"]
 _MS_MOST, _MS_WARN = 3.0, 1.8  # peak sensitivity: 3 leaves a phase margin of 19 deg
 _BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
 _FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is worse than none
-_VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
 # Figures a second to inflate by without a laser: the loop then has 0.3 s of delay and keeps its margins
@@ -129,9 +128,9 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
         say.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
     why = f"faster than the pump's {full_um_per_s:g} um/s"
     say.warn(loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it")
-    bleed_um_per_s = loop.bleed_fraction * _VENT_FULL_UM_PER_S
+    bleed_um_per_s = loop.bleed_fraction * gas.VENT_FULL_UM_PER_S
     why = f"the vent would take about {bleed_um_per_s:.0f} um/s, half of the pump's flow or more"
-    remedy = f"set less than {0.5 * full_um_per_s / _VENT_FULL_UM_PER_S:.3f}"
+    remedy = f"set less than {0.5 * full_um_per_s / gas.VENT_FULL_UM_PER_S:.3f}"
     say.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
     swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
     why = f"the pump needs {swing_s:.0f} s from none to full: the loop would swing"

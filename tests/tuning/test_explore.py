@@ -20,6 +20,7 @@ from tornado.websocket import websocket_connect
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder
 from membrane_ctrl.sessions.live_hold import HoldError
@@ -31,6 +32,7 @@ from tuning.explore.page import saver
 from tuning.identification import disturbance, loop_model
 from tuning.identification.characterise import SHORT
 from tuning.proposal import prediction
+from tuning.proposal.verify import Stage
 from tuning.rig import Rig
 
 PLANT = loop_model.PlantModel(0.9, 0.4, 0.3, 1.2)
@@ -159,6 +161,36 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
     with pytest.raises(HoldError, match="the mirror is not held"):
         session.verify_step(opened, Lost())  # type: ignore[arg-type]
     assert not opened.done("verify")
+
+
+@pytest.mark.parametrize(
+    ("growths", "kept", "until_s"),
+    [((1.0,) * 4, True, 600.0), ((1.0, 1.0, 1.0, 1.15, 1.05), True, 1200.0), ((1.0, 1.6), False, 180.0),
+     ((1.0, 1.0, 1.0, 1.15, 1.12), False, 1200.0), ((1.0, 1.0, 1.0, 1.3), False, 600.0)],
+)  # fmt: skip
+def test_a_close_verification_goes_on_for_as_long_again(
+    template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    growths: tuple[float, ...], kept: bool, until_s: float,
+) -> None:  # fmt: skip
+    """Ten minutes tell a standard deviation to 13 %."""
+    opened = copy_of(template, tmp_path)
+    folder.write(opened.file("applied.json"), {})
+    left, told = list(growths), []
+    held = SimpleNamespace(followed_by=lambda more: held)
+    rig = SimpleNamespace(
+        dt_s=1.0, set_gains=lambda *given: None, keep=lambda: told.append("keep"), hold=lambda seconds: None,
+        hold_about=lambda seconds: (held, np.zeros(round(seconds))),
+    )  # fmt: skip
+
+    def look(record: object, setpoint_um: FloatArray, trial: object, growth_max: float) -> Stage:
+        growth = left.pop(0)
+        reason = "grown" if growth > growth_max else ""
+        return Stage(float(setpoint_um.size), growth, 1.0, growth, growth_max, 1.3, 0.0, reason)
+
+    monkeypatch.setattr(session.verify, "look", look)
+    monkeypatch.setattr(session.loop_model, "save_record", lambda path, record: None)
+    done = session.verify_step(opened, rig)  # type: ignore[arg-type]
+    assert (done.kept, done.stages[-1].time_s, told) == (kept, until_s, ["keep"] * kept)
 
 
 def test_a_run_gives_its_weather_and_says_whose_plant_it_is(template: Path, tmp_path: Path) -> None:

@@ -109,6 +109,25 @@ def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
+def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -> None:
+    """The curve began at 0.06 with 0.85 um/s, more than the leak, and the session was told to open the bleed."""
+    pump = ForeignPump("root", 6.74, 0.45, 1.38)
+    found, _ = mapped(tmp_path, ForeignPlant(pump, 141, 0.41, 0.57, laser_um=0.11))
+    assert PumpCurve(found.pump).least_flow_um_per_s < 0.2
+    assert worst_share(found, pump) < 0.03
+
+
+@pytest.mark.campaign
+def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> None:
+    """With the line of the defaults the hold of a pump 15 times its leak swings by 20 um, and was not surveyed."""
+    pump = ForeignPump("root", 29.4, 0.25, 0.45)
+    found, link = mapped(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
+    assert worst_share(found, pump) < 0.03
+    late = [row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)]
+    assert max(abs(row.truth_displacement_um) for row in late) < 12.0
+
+
+@pytest.mark.campaign
 @pytest.mark.parametrize("gusts", [False, True])
 @pytest.mark.parametrize("shape", sorted(CURVES))
 def test_every_actuator_is_mapped(tmp_path: Path, shape: str, gusts: bool) -> None:
@@ -176,7 +195,7 @@ def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: 
 
 
 def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
-    said = "rises from 0.1 um/s at a command of 0.25 to 17.0 um/s at 0.35, and the mirror loses 1.8 um/s"
+    said = "rises from 0.1 um/s at a command of 0.25 to 17.0 um/s at 0.35, and the mirror loses 1.8 um/s: throttle"
     with pytest.raises(ValueError, match=said):
         survey_of([0.25, 0.35], [0.1, 17.0], 1.8).result()
     with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # what is between may hold it
@@ -232,6 +251,21 @@ def test_the_levels_with_the_largest_errors_are_visited_first() -> None:
     survey._branches[True].sigmas[1:] = [0.05, 0.05, 0.30, 0.06]  # of the smaller ones that of the leak
     survey._wanted = set(survey.fit.levels)
     assert [level.fraction for level in survey._visits()[:2]] == [0.6, 0.8]
+
+
+@pytest.mark.parametrize(
+    ("flows", "finer"),
+    [([0.0, 0.7, 1.4], True),  # of a leak of 0.57: no command known so far gives less
+     ([0.0, 0.2, 1.4], False)],
+)  # fmt: skip
+def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(flows: list[float], finer: bool) -> None:
+    assert (0.053 in survey_of([0.045, 0.061, 0.2], flows, 0.57)._finer(True)) == finer
+
+
+@pytest.mark.parametrize(("last", "up"), [(1.0, 0.55), (3.5, 0.4)])
+def test_a_weak_pump_gets_more_than_the_largest_command_so_far(last: float, up: float) -> None:
+    """Which did not lift the mirror: it sank until its guard ended the round, nine times."""
+    assert survey_of([0.2, 0.4], [0.5, last], 1.2)._up() == pytest.approx(up)
 
 
 class Standing:
@@ -300,7 +334,7 @@ def test_steps_that_see_little_are_repeated_for_longer(
 
 @pytest.mark.parametrize(
     ("fractions", "flows", "said"),
-    [([0.03, 0.22], [2.4, 4.8], r"2\.4 um/s already at a command of 0\.03, .* open the bleed"),
+    [([0.03, 0.22], [2.4, 4.8], r"to 2\.4 um/s at 0\.03, .* larger by 0\.026"),
      ([0.23, 0.42], [12.6, 14.8], "did not come back"),
      ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather")],
 )  # fmt: skip

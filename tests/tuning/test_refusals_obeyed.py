@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +28,6 @@ class Refusal:
     plant: Callable[[], ForeignPlant] = lambda: ForeignPlant(ForeignPump(), weather=0.3, laser_um=0.5)
     wrong: dict[str, float] = field(default_factory=dict)  # until the refusal is obeyed
     then: Callable[[], ForeignPlant] | None = None  # another bench than before
-    bleed_fraction: float = 0.0  # from then on
     code: Exit = Exit.REJECTED
 
 
@@ -54,14 +54,11 @@ REFUSALS = {
     "laser lost": Refusal(
         ("characterise",), "no valid laser reading; start or resume", wrong={"no_light": 1}, code=Exit.DEVICE_FAILED
     ),
-    "too tight": Refusal(
-        ("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1), bleed_fraction=0.005
-    ),
+    "too tight": Refusal(("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1)),
     "least flow above the leak": Refusal(
         ("pump",),
         "open the bleed",
         plant=lambda: ForeignPlant(ForeignPump("bottom unreachable", 25.0, 0.3, 0.3), 5, 0.8, 0.6, laser_um=0.5),
-        bleed_fraction=0.034,
     ),
     "relays stopped by noise": Refusal(
         ("characterise",),
@@ -110,7 +107,8 @@ def obeyed(refusal: Refusal, logs: Path, monkeypatch: pytest.MonkeyPatch, capsys
     assert refusal.said in said
     assert "Traceback" not in said
     monkeypatch.setattr(Hold, "obeyed", True)
-    loop["bleed_fraction"] = refusal.bleed_fraction
+    asked = re.search(r"loop\.bleed_fraction larger by ([\d.]+)", said)
+    loop["bleed_fraction"] = float(asked[1]) if asked else 0.0
     code, said = tuned(refusal.instead or refusal.words)
     assert code == Exit.DONE, said
 

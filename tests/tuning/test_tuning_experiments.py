@@ -14,11 +14,11 @@ from membrane_ctrl.control.experiments.machine import (
     Around,
     BenchSample,
     ExcursionGuard,
+    Experiment,
     Finished,
     Patterned,
     Relay,
     doublets,
-    multisine,
     quiet_stretch,
     steps,
 )
@@ -49,12 +49,18 @@ class StuckPump(TwinBench):
         return super().exchange(0.31 if stuck else pump_fraction, vent_fraction)
 
 
+def run(rig: Rig, experiment: Experiment, around: Around) -> tuple[Record, Finished]:
+    """An experiment about 0 inside its guard."""
+    guard = ExcursionGuard(experiment, around, 0.0, 1 / rig.dt_s)
+    return rig._run(guard, around.holding_flow_um_per_s)
+
+
 def relay_after_hold(bench: TwinBench, case: Case) -> tuple[Rig, Record, Finished, float]:
     """Hold for 60 s, then the relay; with the largest true excursion in it."""
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     around = rig.around(rig.hold(60.0).part(20.0, 60.0))
     start = len(bench.true_um)
-    record, end = rig.run(Relay(around, 0.0), around, 0.0)
+    record, end = run(rig, Relay(around, 0.0), around)
     return rig, record, end, max(abs(x) for x in bench.true_um[start:])
 
 
@@ -163,7 +169,7 @@ def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
         doublets(around, 1.0)
 
 
-@pytest.mark.parametrize("make", [steps, doublets, multisine])
+@pytest.mark.parametrize("make", [steps, doublets])
 @pytest.mark.parametrize("gain", [1 / 3, 1.0, 3.0])
 def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float) -> None:
     assert callable(make)
@@ -176,7 +182,7 @@ def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float
     assert np.ptp(flow) > 0.2
 
 
-@pytest.mark.parametrize("make", [steps, multisine])
+@pytest.mark.parametrize("make", [steps, doublets])
 def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
     assert callable(make)
     case = Case()
@@ -184,7 +190,7 @@ def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     around = rig.around(rig.hold(60.0).part(20.0, 60.0))
     start = len(bench.true_um)
-    record, end = rig.run(Patterned(around, make(around, 1.0), 40.0, 0.0), around, 0.0)
+    record, end = run(rig, Patterned(around, make(around, 1.0), 40.0, 0.0), around)
     assert end.completed, end.reason
     assert record.duration_s == pytest.approx(40.0)
     assert max(abs(x) for x in bench.true_um[start:]) < 10.0
@@ -202,7 +208,7 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
     bench = TwinBench(case, 1)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     around = rig.around(rig.hold(60.0).part(20.0, 60.0))
-    rig.run(Patterned(around, lambda time_s: 0.0, 5.0, 0.0), around, 0.0)
+    run(rig, Patterned(around, lambda time_s: 0.0, 5.0, 0.0), around)
     after = rig.hold(5.0)
     assert np.abs(after.flow_um_per_s - around.holding_flow_um_per_s).max() < 0.05
 

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
+from membrane_ctrl.control.experiments.machine import bleed_open
 from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import BLOCK_S, PumpFit
@@ -145,7 +146,8 @@ class Surveyed:
                 "`tune pump` again"
             )
         if not self.held:
-            self._refuse_least()
+            self._refuse_steep(1.0, "the hold does not bring the mirror back")
+            raise ValueError(_ASTRAY)
         known = sigmas <= _USEFUL_SHARE * self.full_um_per_s
         low = top = int(np.argmin(np.where(known, np.abs(flows - _REACHES_LEAKS * leak), np.inf)))
         while low > 0 and known[low - 1]:
@@ -154,7 +156,7 @@ class Surveyed:
             top += 1
         beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
         if beyond:
-            self._refuse_step()
+            self._refuse_steep(_STEP_LEAKS, "no command holds the mirror")
         if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
             unknown = min(top + 1, known.size - 1) if beyond else low - 1
             where = f"{'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f}"
@@ -166,32 +168,17 @@ class Surveyed:
         part = slice(low, top + 1)
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
 
-    def _refuse_least(self) -> None:
-        """Raises ValueError as the mirror is not brought back, with the least flow if that is the reason."""
+    def _refuse_steep(self, leaks: float, said: str) -> None:
+        """Raises ValueError if the flow rises at once from less than the leak to more than so many times as much."""
         fractions, flows, sigmas = self.rising.columns
         leak = self.fit.leak_um_per_s
-        first = int(np.argmax(flows - 2 * sigmas > leak))
-        none = (flows[:first] + 2 * sigmas[:first] < _NONE_SHARE * self.full_um_per_s).all()
-        if first and none and fractions[first] - fractions[first - 1] <= _STEP_MOST:
-            raise ValueError(
-                f"the hold does not bring the mirror back: the pump gives {flows[first]:.1f} um/s already at a "
-                f"command of {fractions[first]:.2f}, and the mirror loses {leak:.1f} um/s: "
-                "throttle the pump, or open the bleed (loop.bleed_fraction), then run `tune pump` again"
-            )
-        raise ValueError(_ASTRAY)
-
-    def _refuse_step(self) -> None:
-        """Raises ValueError if the flow rises at once from less than the leak to several times as much."""
-        fractions, flows, sigmas = self.rising.columns
-        leak = self.fit.leak_um_per_s
-        above = int(np.argmax(flows - 2 * sigmas > _STEP_LEAKS * leak))
+        above = int(np.argmax(flows - 2 * sigmas > leaks * leak))
         below = above - 1
         if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
             raise ValueError(
-                f"the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
-                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: "
-                "no command holds it; throttle the pump, or open the bleed (loop.bleed_fraction), then run "
-                "`tune pump` again"
+                f"{said}: the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
+                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: throttle "
+                f"the pump, or {bleed_open(leak, flows[above])}, then run `tune pump` again"
             )
 
 

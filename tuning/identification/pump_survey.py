@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from membrane_ctrl.control.experiments.trial import PumpStep
+from membrane_ctrl.control.gas import STALL_MARGIN
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import NO_FIT, Level, PumpFit, PumpRun, fit
 from tuning.identification.pump_map import (
@@ -25,10 +26,11 @@ from tuning.identification.pump_map import (
     stuck,
 )
 
-_KNOWN_SHARE = 0.010  # standard error of a level, of the full flow
+_KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
 _BENT_SHARE = 0.025  # of the full flow, by which a kink between two levels may be hidden
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
+_FINE_EDGE, _TOO_MUCH = 0.002, 0.6  # a jump to more than this share of the leak may be a steep rise through it
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1200.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
@@ -195,7 +197,9 @@ class PumpSurvey:
         found: list[float] = []
         for i, (low, high) in enumerate(pairwise(fractions.tolist())):
             clear = flows[i + 1] - flows[i] > 4 * math.hypot(sigmas[i], sigmas[i + 1])
-            if clear and flows[i] < 0.02 * full and flows[i + 1] > JUMP_SHARE * full and high - low > _EDGE:
+            least = float(np.interp(high + STALL_MARGIN, fractions, flows))  # that a loop would give
+            edge = _FINE_EDGE if least > _TOO_MUCH * self.fit.leak_um_per_s else _EDGE
+            if clear and flows[i] < 0.02 * full and flows[i + 1] > JUMP_SHARE * full and high - low > edge:
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
@@ -309,10 +313,13 @@ class PumpSurvey:
         ).map()  # fmt: skip
 
     def _up(self) -> float:
-        """The smallest known command that lifts the mirror well; the largest if none does."""
+        """The smallest known command that lifts the mirror well; if none does, the first that may."""
         fractions, flows, sigmas = self._branches[True].columns
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
-        return float(lifts[0] if lifts.size else fractions[-1])
+        if lifts.size:
+            return float(lifts[0])
+        may = (_rounded(f) for f in np.linspace(fractions[-1], 1.0, 9).tolist())
+        return next((f for f in may if self._net(Level(f)) > self.fit.leak_um_per_s), 1.0)
 
 
 def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:

@@ -29,6 +29,7 @@ SETTLE_LEAST_S, _SETTLE_MOST_S = 20.0, 120.0
 _SETTLE_TIME_CONSTANTS = 4.0  # of the loop's slowest mode: 2 % of the transient from the change of gains is left
 _OBSERVE_LEAST_S = 300.0  # before that, the session's weather is assumed
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
+_CLOSE = 1.13  # of the largest growth
 _SEGMENT_S = 20.0
 _RESONANCE_LEAST_S = 180.0  # 17 half-overlapping segments: power to a quarter
 _LAGS_S = 1.0  # shorter than the centre's memory (2 s and more), with 50 times as many pairs as one lag
@@ -48,6 +49,11 @@ class Stage:
     ms: float  # sensitivity seen; NaN while the record is too short
     lost_fraction: float  # readings lost
     reason: str  # why it fails; empty if it passes
+
+    @property
+    def close(self) -> bool:
+        """Whether it fails by less than the standard deviation of ten minutes scatters."""
+        return self.growth_max < self.growth < _CLOSE * self.growth_max
 
 
 def settle_s(loop: LoopConfig) -> float:

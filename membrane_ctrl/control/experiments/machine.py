@@ -10,8 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
+from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import LowPass
 
 # An experiment's view of a tick.
@@ -215,23 +214,6 @@ def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
     return lambda time_s: size if time_s % period_s < pulse_s else -down
 
 
-def multisine(
-    around: Around, gain: float, slowest_rad_per_s: float = 0.3, fastest_rad_per_s: float = 6.0, tones: int = 12
-) -> Pattern:
-    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
-
-    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
-    """
-    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
-    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
-    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
-    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
-    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
-    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
-    scale = min(min(room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
-    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
-
-
 def room(around: Around) -> tuple[float, float]:
     """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight or too leaky."""
     up = around.full_flow_um_per_s - around.holding_flow_um_per_s
@@ -240,9 +222,16 @@ def room(around: Around) -> tuple[float, float]:
         raise ValueError(
             f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} um/s in the pump's range of "
             f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} um/s: "
-            + ("open the bleed" if down <= 0 else "find the leak")
+            + (bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s) if down <= 0 else "find the leak")
         )
     return up, down
+
+
+def bleed_open(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
+    """What to do where a mirror loses too little gas for the least flow of its pump."""
+    more_um_per_s = max(0.3, 1.5 * least_um_per_s - loss_um_per_s)
+    share = more_um_per_s / gas.VENT_FULL_UM_PER_S
+    return f"open the bleed by {more_um_per_s:.1f} um/s (loop.bleed_fraction larger by {share:.3f})"
 
 
 # Bounded asymmetric relay about the holding flow.
@@ -295,7 +284,9 @@ class Relay:
             self._switch()
         elif self._since_switch_s > _PATIENCE_S:
             way = "rise" if self._direction > 0 else "sink"
-            remedy = "check the pump, its tube and the leak" if self._direction > 0 else "open the bleed"
+            around = self._around
+            open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
+            remedy = "check the pump, its tube and the leak" if self._direction > 0 else open_bleed
             return Finished(False, f"{NO_ANSWER} {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}")
         around = self._around
         swing = self._direction * self._amplitudes_um_per_s[self._direction]
