@@ -255,7 +255,7 @@ class EstimatorConfig(Section):
     process_value: Literal["laser", "estimate", "optics"] = "laser"
     """What the inner loop holds: the laser's reading, the estimate of the centre, or that without a laser: `optics`
     uses none, fitted or not. Change it to hold with the optics, or by them alone."""
-    gain_per_s: Annotated[float, Field(gt=0, le=20)] = 10.0
+    gain_per_s: Annotated[float, Field(gt=0, le=20)] = 16.0
     """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is uncertain."""
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08
     """Dead time from command to gas. Change it to what `tune` found."""
@@ -273,7 +273,7 @@ class EstimatorConfig(Section):
     """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
     air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
     """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
-    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.05
+    centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.02
     """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
     """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak that changes slowly:

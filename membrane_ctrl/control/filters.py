@@ -160,7 +160,8 @@ class LearnedFactor:
 
     def learn(self, slope: float, information: float, forget: float) -> None:
         """Take the slope of the log-likelihood from one reading, and the information that it bears."""
-        self._information += information - forget * self._information
+        # at least that: a few readings must not overturn a level that has hardly shown for long
+        self._information = max(_UNREST, self._information + information - forget * self._information)
         self._log = min(max(self._log + slope / self._information, -self._bound), self._bound)
 
 
@@ -194,9 +195,8 @@ class ReadingNoise:
         `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
         """
         forget = min(1.0, dt_s / _MEMORY_S)
-        innovation = min(max(innovation, -_LIMIT), _LIMIT)
-        size, runs = (innovation**2 - 1) / 2, math.sqrt(share / 8) * innovation * self._past
-        known = share / 8
+        innovation, known = min(max(innovation, -_LIMIT), _LIMIT), share / 8
+        size, runs = (innovation**2 - 1) / 2, math.sqrt(known) * innovation * self._past
         by_noise = 1 - share / 2  # change of the innovations' variance with the noise, both as logarithms
         leads = bool(walks)
         self._level.learn(by_noise * size - leads * runs, by_noise**2 / 2 + leads * known, forget)

@@ -56,11 +56,11 @@ class InnerLoop:
 
     def __init__(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig = EstimatorConfig()) -> None:  # noqa: B008 (frozen)
         self._loop = loop
-        lag_s = estimator.pump_lag_s
-        fast_per_s = max(estimator.gain_per_s, 1 / lag_s) if lag_s > 0 else 0.0
-        # both poles of the loop: its own and the pump's, or faster than that (docs/estimator.md)
-        self._error_gain_per_s = lag_s * estimator.gain_per_s * fast_per_s if lag_s > 0 else estimator.gain_per_s
-        self._due_gain = (1 - lag_s * estimator.gain_per_s) * (1 - lag_s * fast_per_s)
+        lag_s, own_s, tick_s = estimator.pump_lag_s, 1 / estimator.gain_per_s, 1 / loop.rate_hz
+        # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves (docs/estimator.md)
+        slow_per_s, fast_per_s = (filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s)))
+        self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
+        self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = loop.flow_most_um_per_s(pump)
         self._measured = filters.LowPass(loop.measurement_filter_s)

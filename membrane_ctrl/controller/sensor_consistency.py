@@ -197,7 +197,7 @@ def _of_warning(warning: film_health.FilmWarning) -> Event:
 # in `inflate` the film's gain may still be another one
 _ESTIMATED = frozenset({State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 _STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
-_STANDS_S = 1.0  # a sensor that comes and goes within this is not reported
+_STANDS_S = 1.5  # a sensor that comes and goes within this, as a slower camera does at first, is not reported
 
 
 class Holders:

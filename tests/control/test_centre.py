@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig
+from benchmarks.centre import Optics, Sensors, hold
+from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, TwinConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, Transit
@@ -324,6 +325,16 @@ def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
     assert np.ptp(centres) < 0.2
 
 
+# Its loop.
+
+
+def test_a_loop_of_few_ticks_a_second_does_not_swing() -> None:
+    """A tick of 0.25 s is four times the loop's own time: what it removes in one must not exceed the error."""
+    loop = LoopConfig(rate_hz=4.0)
+    held = hold(Sensors(optics=Optics(rate_hz=4.0)), TwinConfig(start_error_um=0.0), 60.0, loop=loop)
+    assert held.after(30.0).std() < 0.1
+
+
 # Gas in transit.
 
 
@@ -388,6 +399,15 @@ def test_learned_noise_stays_within_its_bounds() -> None:
             reading.learn(innovation * (k % 2), 0.5, DT_S, ((level, 1.0),))
         assert 0.999 / 25 <= reading.factor <= 25 * 1.001
         assert 0.999 / 900 <= level.factor <= 900 * 1.001
+
+
+def test_a_level_that_hardly_showed_for_long_is_not_overturned_by_a_few_readings() -> None:
+    level = configured_walk()
+    for _ in range(5000):
+        level.learn(0.0, 1e-4, 0.01)
+    for _ in range(5):
+        level.learn(4.0, 0.2, 0.01)
+    assert math.log(level.factor) < 5.1
 
 
 def test_a_ramp_is_found_with_its_begin_and_slope_and_white_noise_is_none() -> None:
