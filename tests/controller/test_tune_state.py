@@ -77,7 +77,7 @@ class Held:
         return float(max(abs(row.truth_displacement_um) for row in self.rows if row.mono_s >= since_s))
 
 
-@pytest.mark.parametrize("kind", ["relay", "steps", "doublets"])
+@pytest.mark.parametrize("kind", ["relay", "steps", "doublets", "multisine"])
 def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind: str) -> None:
     held = Held()
     held.go(0.1, tune(kind=kind))

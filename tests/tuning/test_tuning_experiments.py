@@ -19,6 +19,7 @@ from membrane_ctrl.control.experiments.machine import (
     Patterned,
     Relay,
     doublets,
+    multisine,
     quiet_stretch,
     steps,
 )
@@ -169,7 +170,7 @@ def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
         doublets(around, 1.0)
 
 
-@pytest.mark.parametrize("make", [steps, doublets])
+@pytest.mark.parametrize("make", [steps, doublets, multisine])
 @pytest.mark.parametrize("gain", [1 / 3, 1.0, 3.0])
 def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float) -> None:
     assert callable(make)
@@ -182,7 +183,7 @@ def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float
     assert np.ptp(flow) > 0.2
 
 
-@pytest.mark.parametrize("make", [steps, doublets])
+@pytest.mark.parametrize("make", [steps, multisine])
 def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
     assert callable(make)
     case = Case()

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import LowPass
 
@@ -212,6 +214,23 @@ def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
     down = min(down, size)
     period_s = pulse_s * (1 + size / down)
     return lambda time_s: size if time_s % period_s < pulse_s else -down
+
+
+def multisine(
+    around: Around, gain: float, slowest_rad_per_s: float = 0.3, fastest_rad_per_s: float = 6.0, tones: int = 12
+) -> Pattern:
+    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
+
+    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
+    """
+    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
+    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
+    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
+    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
+    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
+    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
+    scale = min(min(room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
+    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
 
 
 def room(around: Around) -> tuple[float, float]:

@@ -25,7 +25,7 @@ class PumpStep(Section):
 
 
 LIMIT_MAX_UM = 30.0
-ExperimentKind = Literal["relay", "steps", "doublets", "pump_map"]
+ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
 
 
 class ExperimentSpec(Section):
@@ -74,7 +74,7 @@ class PumpSteps:
         return self._in_step_s > now.duration_s
 
 
-_PATTERNS = {"steps": machine.steps, "doublets": machine.doublets}
+_PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
 
 
 class Trial:
