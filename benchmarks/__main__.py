@@ -41,7 +41,9 @@ NAMES = (
     "calibration_coverage",
     "benches",
     "recording",
+    "recording_tracked",
     "memory",
+    "tracking_long",
     "soak",
 )
 OUT = Path("docs/bench.json")

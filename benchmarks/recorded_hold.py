@@ -37,23 +37,39 @@ class RunPart:
                 ring.put(message)
 
 
+FRAME_UM = 2e-3  # noise of a tracked frame's terms, each: 12 nm of figure
+_COVARIANCE_EVERY = 200  # tracked frames: 10 s
+
+
 class RealisticShapes:
-    """Shapes of the truth with the noise and the full covariance of a reconstruction, which do not compress."""
+    """Shapes of the truth with the noise and the full covariance of a reconstruction, which do not compress.
+
+    Tracked ones are rounded, and keep their covariance for a while, as those of `LiveTracker`.
+    """
 
     def __init__(self, bench: VirtualBench, config: Config) -> None:
         self._truth = TruthShape(bench, config, seed=1)
+        self._track = config.shape.mode == "track"
         self._rng = np.random.default_rng(1)
         mixed = self._rng.normal(size=(36, 36)) * 1e-3
-        self._covariance_um2 = mixed @ mixed.T
+        self._covariance_um2 = self._kept_um2 = mixed @ mixed.T
 
     def __call__(self, now_s: float) -> ShapeEstimate | None:
         """One cycle."""
         estimate = self._truth(now_s)
         if estimate is None:
             return None
-        noisy = estimate.coeffs_um + 1e-3 * self._rng.normal(size=36)
-        scaled = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
-        return ring_trip(replace(estimate, coeffs_um=noisy, covariance_um2=scaled))
+        noisy = estimate.coeffs_um + (FRAME_UM if self._track else 1e-3) * self._rng.normal(size=36)
+        if not self._track or estimate.cycle % _COVARIANCE_EVERY == 1:
+            self._kept_um2 = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
+        found = replace(estimate, coeffs_um=noisy, covariance_um2=self._kept_um2)
+        if self._track:
+            latency_s, residual_urad = round(self._rng.normal(0.013, 0.002), 5), round(self._rng.normal(30.0, 0.5), 2)
+            found = replace(
+                found, kind="track", coeffs_um=noisy.round(3), sag_um=round(found.sag_um, 4), latency_s=latency_s,
+                displacement_um=round(found.displacement_um, 3), slope_residual_urad=residual_urad,
+            )  # fmt: skip
+        return ring_trip(found)
 
 
 def ring_trip(estimate: ShapeEstimate) -> ShapeEstimate:

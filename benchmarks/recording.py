@@ -5,9 +5,11 @@ python -m benchmarks recording
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 from contextlib import ExitStack
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,7 +29,7 @@ WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little
 DURATION_S = 3600  # one whole segment
 _RINGS = {
     "inputs": (400, MESSAGE_BYTES),
-    "shapes": (16, 1 << 16),
+    "shapes": (64, 1 << 16),
     "events": (64, 4096),
 }
 
@@ -42,14 +44,37 @@ class HandClock(RunClock):
         return HandClock.moment_s
 
 
+@dataclass(frozen=True)
+class Recorded:
+    """What a run took."""
+
+    mb_a_day: dict[str, float]  # by pattern of files
+    rrd_before_mb: float  # a day, before they were optimised
+    optimising_s: float
+    busy: float  # share of a core
+
+
 def run() -> list[Figure]:
     """The benchmark."""
+    found = recorded(Config(), DURATION_S)
+    mb = found.mb_a_day
+    return [
+        at_most("recording, optimised, without frames", mb["*.rrd"] + mb["columns/*"], "MB a day", 550.0),
+        at_most("of it Rerun segments", mb["*.rrd"], "MB a day", None, "before optimising", found.rrd_before_mb),
+        at_most("of it columns", mb["columns/*"], "MB a day"),
+        at_most("optimising an hour at the lowest priority", found.optimising_s, "s"),
+        at_most("recorder, share of a core", 100 * found.busy, "%"),
+    ]
+
+
+def recorded(config: Config, duration_s: float) -> Recorded:
+    """Record a run of some seconds."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        return _measured(Path(folder), stack)
+        return _measured(Path(folder), stack, config, duration_s)
 
 
-def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
-    config, clock = Config(), HandClock(0.0, datetime.now(UTC))
+def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float) -> Recorded:
+    clock = HandClock(0.0, datetime.now(UTC))
     run_dir = create_run_folder(folder, "day", clock.origin_utc, config)
     addresses = {name: stack.enter_context(ring(*size)) for name, size in _RINGS.items()}
     readers = {name: RingReader(address) for name, address in addresses.items()}
@@ -59,26 +84,21 @@ def _measured(folder: Path, stack: ExitStack) -> list[Figure]:
     recording = Recording(run_dir, "day", clock, config)
     recorder = Recorder(run_dir, clock, config, readers, recording, None, lambda report: None)
     busy_s = 0.0
-    for number, part in enumerate(parts_of(config, DURATION_S, WRITE_S)):
+    for number, part in enumerate(parts_of(config, duration_s, WRITE_S)):
         HandClock.moment_s = (number + 1) * WRITE_S
         part.put(writers)
         begun_s = time.process_time()
         recorder.drain()
         recorder.write()
         busy_s += time.process_time() - begun_s
-    writers["events"].put(b'{"kind": "end", "exit": "done", "mono_s": 3600.0}')
+    ended = json.dumps({"kind": "end", "exit": "done", "mono_s": duration_s})
+    writers["events"].put(ended.encode())
+    a_day = DAY_S / duration_s / 1e6
     before = _bytes(run_dir, "*.rrd")
     recorder.finish(in_haste=True)
     optimising_s = _optimised_s(run_dir)
-    days = DURATION_S / DAY_S
-    mb = {pattern: _bytes(run_dir, pattern) / 1e6 / days for pattern in ("*.rrd", "columns/*")}
-    return [
-        at_most("recording, optimised, without frames", sum(mb.values()), "MB a day", 550.0),
-        at_most("of it Rerun segments", mb["*.rrd"], "MB a day", None, "before optimising", before / 1e6 / days),
-        at_most("of it columns", mb["columns/*"], "MB a day"),
-        at_most("optimising an hour at the lowest priority", optimising_s, "s"),
-        at_most("recorder, share of a core", 100 * busy_s / DURATION_S, "%"),
-    ]
+    mb = {pattern: _bytes(run_dir, pattern) * a_day for pattern in ("*.rrd", "columns/*", "columns/shapes*")}
+    return Recorded(mb, before * a_day, optimising_s, busy_s / duration_s)
 
 
 def _optimised_s(run_dir: Path) -> float:

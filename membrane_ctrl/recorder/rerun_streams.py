@@ -168,9 +168,6 @@ class TelemetryStreams:
             self._codes[lane.field] = float(codes[-1])
 
 
-# Shape estimates to Rerun: the numbers of every cycle, and maps now and then.
-
-
 # Three maps of the change a minute are 60 MB a day. Nothing is lost, as any map can be rebuilt from the coefficients
 # of its cycle. In the first minutes somebody is watching.
 DIFFERENCE_INTERVAL_S = 60.0

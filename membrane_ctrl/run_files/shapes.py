@@ -188,9 +188,6 @@ MAPS = {
     "uncertainty": "noise of a cycle, 1σ",
 }
 
-# Maps of a shape estimate for the timeline: height, change since the first, 1-sigma uncertainty, scatter.
-
-
 Map = NDArray[np.float32]
 
 MAP_PX = 96  # resolves all 36 terms (radial order 7)

@@ -48,7 +48,7 @@ class Command:
     reads: str = "logs"
 
 
-# RUN, LOGS, SET, SETS, TUNING, LIVE, H5 and OUT are put in; `runs` costs 15 ms and `report` a second
+# RUN, LOGS, SET, SETS, TRACK, FIGURES, TUNING, LIVE, H5 and OUT are put in; `runs` costs 15 ms and `report` a second
 COMMANDS = (
     Command("runs", ("runs", "--logs", "LOGS"), 160),
     Command("runs --json", ("runs", "--logs", "LOGS", "--json"), 50),
@@ -67,6 +67,8 @@ COMMANDS = (
     Command("uncertainty", ("uncertainty", "SET", "--trials", "2"), 10, "sets"),
     Command("stability", ("stability", "SETS", "--trials", "2"), 10, "sets"),
     Command("calibrate", ("calibrate", "SET0", "SET1", "--out", "OUT.toml"), 10, "sets"),
+    Command("track", ("track", "TRACK", "--no-pictures"), 30, "track"),
+    Command("modes", ("modes", "FIGURES", "--no-pictures"), 20, "track"),
     Command("measure h5", ("measure", "H5", "--no-pictures"), 60, "sofast"),
     Command("calibrate --live", ("calibrate", "--live", "--session", "LIVE", "--no-pictures"), 3, "live"),
     Command("tune history", ("tune", "history", "--logs", "TUNED"), 20, "tuned"),
@@ -113,7 +115,7 @@ class Room:
 
     def make(self, kind: str) -> None:
         """A good folder of a kind, unless it is there."""
-        from good_folders import good_inputs, good_live, good_run, good_sets, good_sofast, good_tuning
+        from good_folders import good_inputs, good_live, good_run, good_sets, good_sofast, good_track, good_tuning
 
         folder = self._good / kind
         if kind == "live":
@@ -127,6 +129,8 @@ class Room:
                     good_inputs(self._good / "inputs-000.bin")
                 case "sets":
                     good_sets(self._good)
+                case "track":
+                    good_track(folder)
                 case "sofast":
                     good_sofast(folder)
                 case "live":
@@ -168,6 +172,7 @@ class Room:
         places = {
             "LOGS": inside, "RUN": inside / self._run_name,
             "SETS": inside, "SET": inside / rng.choice(("0000", "0001")),
+            "TRACK": inside / "track", "FIGURES": inside,
             "TUNED": inside, "TUNING": inside / "tuning" / self._tuning_name,
             "LIVE": inside, "H5": inside / "m.h5",
             "SET0": inside / "0000", "SET1": inside / "0001", "OUT": inside.parent / "out",

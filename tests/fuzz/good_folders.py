@@ -92,6 +92,15 @@ def good_tuning(folder: Path) -> None:
     session.rename(session.with_name(TUNING))
 
 
+def good_track(folder: Path) -> None:
+    """A tracking set `track` with its reference `full`, and half a minute of figures in `track.npz`."""
+    assert run(["simulate", str(folder), "--shrink", "12", "--track", "6"]) == 0
+    for extra in folder.glob("*/truth.*"):
+        extra.unlink()
+    figures_um = 1e-3 * np.random.default_rng(1).normal(size=(600, 36))
+    np.savez(folder / "track.npz", time_s=np.arange(600) / 20, coeffs_um=figures_um)
+
+
 def good_live(folder: Path, sets: Path) -> None:
     """A session of `calibrate --live` that has all its sets."""
     (folder / "sets").mkdir(parents=True)

@@ -6,7 +6,7 @@ leaves of them, and the covariance stays the same for many frames.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,8 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 # A gust may lose the order of a few frames, which the next ones have again.
 LOST_S = 1.0
+# A new covariance is 100 times a figure in the record: one for each step of the pattern.
+COVARIANCE_S = 10.0
 # A hand or a lamp goes away by itself, and meanwhile a full cycle would be rejected too.
 REJECTED_S = 10.0
 # The interval between frames is longer in two of three steps: vibrations faster than half the frame rate then have
@@ -67,6 +69,7 @@ class LiveTracker:
         self._tracker: Tracker | None = None
         self._urad_per_rad = math.nan
         self._step, self._stepped_s = 0, -math.inf
+        self._covariance_um2, self._covariance_until_s = np.empty((0, 0)), -math.inf
         self._lost_since_s = self._rejected_since_s = math.inf
 
     @property
@@ -90,7 +93,7 @@ class LiveTracker:
         except (evidence.NoFigureError, ValueError) as error:
             times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
             return live.rejected("full", times, readings, f"no anchor for tracking: {error}")
-        self._step, self._stepped_s = 0, -math.inf
+        self._step, self._stepped_s, self._covariance_until_s = 0, -math.inf, -math.inf
         self._lost_since_s = self._rejected_since_s = math.inf
         return estimate
 
@@ -105,6 +108,9 @@ class LiveTracker:
         found = self._tracker.follow(frames[0], (shown.shift_rad, shown.shift_y_rad), at_s, reading_um)
         if found.verdict != "rejected":
             self._next_step(at_s)
+            if at_s >= self._covariance_until_s:
+                self._covariance_um2, self._covariance_until_s = found.covariance_um2, at_s + COVARIANCE_S
+            found = replace(found, covariance_um2=self._covariance_um2)
         return _estimate(found, reading_um, self._astray(found), self._urad_per_rad)
 
     def _anchored(self, frames: Sequence[Image], displacement_um: FloatArray) -> Tracker:
