@@ -316,8 +316,11 @@ def bench(seed: int) -> dict[str, Any]:
 def answers(path: Path, count: int, bench: Callable[[int], dict[str, Any]]) -> list[dict[str, Any]]:
     """Those already in the file, and the missing ones, which are added to it."""
     path.parent.mkdir(exist_ok=True)
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    known = {one["seed"]: one for one in map(json.loads, lines)}
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    whole = [line for line in lines if line.endswith("\n")]
+    if len(whole) < len(lines):  # a run that was killed may leave half a line
+        path.write_text("".join(whole), encoding="utf-8")
+    known = {one["seed"]: one for one in map(json.loads, whole)}
     for seed in range(count):
         if seed not in known:
             known[seed] = bench(seed)

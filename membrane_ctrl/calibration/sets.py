@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, u
 from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
 from membrane_ctrl.metrology.calibrate.solve import Origin, Problem, Solution, slope_residual, solve, tables_of
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.full import LASER_NOISE_UM, bin_figure
+from membrane_ctrl.metrology.full import FilmMotion, bin_figure
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
@@ -41,8 +41,10 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
     The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
     which no calibration changes).
     """
-    motion_um, sigma_um = _motion_um(checked)
-    figure = bin_figure(optics, checked, motion_um)
+    film = FilmMotion.of(checked)
+    x_um, y_um = film.told_um
+    # what the film moved from x to y is left to the solution: the stated lens makes of it 2 % too much or too little
+    figure = bin_figure(optics, checked, replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean())))
     grid = BinGrid(checked.tracer.geometry, optics.camera, checked.binned.bin_px)
     return residuals.SetPhases(
         name=name,
@@ -51,25 +53,10 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
         screen_mm=figure.points.screen_mm,
         sigma_mm=np.sqrt(np.mean(np.square(figure.sigma_mm), axis=0)),
         displacement_um=checked.stack.mean_reading_um,
-        motion_sigma_um=sigma_um,
-        moved_um=float(np.std(np.concatenate(motion_um))),
+        motion_um=float(x_um.mean() - y_um.mean()),
+        motion_sigma_um=film.x_to_y_sigma_um if math.isfinite(film.x_to_y_sigma_um) else _MOTION_UNSEEN_UM,
+        moved_um=film.moved_um,
     )
-
-
-def _motion_um(checked: Checked) -> tuple[tuple[FloatArray, FloatArray], float]:
-    """Motion of the film during the x and the y frames, and how well the difference of their means is known.
-
-    The fringes see it from frame to frame of one axis, to a tenth of a micrometre, where the laser's noise is one. Of
-    a difference between the axes they make a figure: there the laser counts.
-    """
-    x, y = checked.view.used
-    seen = [axis - axis.mean() for axis in (checked.film_um[: len(x)], checked.film_um[len(x) :])]
-    told = [float(checked.stack.displacement_um[used].mean()) for used in (x, y)]
-    if not all(math.isfinite(mean) for mean in told):
-        return (seen[0], seen[1]), _MOTION_UNSEEN_UM
-    mean_um = checked.stack.mean_reading_um
-    sigma_um = LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
-    return (seen[0] + told[0] - mean_um, seen[1] + told[1] - mean_um), sigma_um
 
 
 def edges_of(figure: SetFigure) -> FloatArray | None:

@@ -10,7 +10,7 @@ from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology import motion
 from membrane_ctrl.metrology.calibrate import residuals
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.full import LASER_NOISE_UM, FullResult
+from membrane_ctrl.metrology.full import LASER_NOISE_UM, X_TO_Y, FilmMotion, FullResult
 from membrane_ctrl.metrology.optics.geometry import Outline, project
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, sag_gradient
 from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
@@ -24,8 +24,9 @@ _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen th
 _UNSEEN_UM = 1000.0  # of the film's motion without a laser, before the fringes are asked
 _UNKNOWN_UM = 20.0  # of the film's place without a laser: a hold, or a mirror left alone for minutes
 _SIGMAS = 4.0  # of the fringes' answer: the film moved
-# Motion from x to y over its RMS among the steps of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
-_X_TO_Y = 5.0
+# the fringes' error in the film's place at a frame, the share of a motion within an axis that its correction leaves,
+# and that of a motion from x to y: a lens of a data sheet is 1 % off
+_SEEN_UM, _SEEN_SHARE, _TOLD_SHARE = 0.1, 0.05, 0.02
 _STEP_MM = 0.01
 _HEAVY = 1e3  # weight of the sag beside the heights
 
@@ -151,8 +152,12 @@ def _alike() -> FloatArray:
     return np.asarray(np.linalg.lstsq(table, np.vstack([heights.T, _HEAVY * rim.T]), rcond=None)[0])
 
 
-def law_effect(patches: budget.Patches, radius_mm: float, inverse: FloatArray) -> FloatArray:
+def law_effect(
+    patches: budget.Patches, radius_mm: float, inverse: FloatArray, slope_variance: float = 0.0
+) -> tuple[FloatArray, float]:
     """(36,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its residual slopes show it.
+
+    The second answer is what noise of the points' slopes adds to its square.
 
     Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the 36 terms and the excess.
     Least squares take some of that for other terms, and the rest is missing from the sag.
@@ -163,15 +168,15 @@ def law_effect(patches: budget.Patches, radius_mm: float, inverse: FloatArray) -
     absorbed = inverse @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True)) / radius_mm**2
     left = np.hstack([b - absorbed.T @ a for a, b in zip(of, beyond, strict=True)]).T
     weights = np.sqrt(np.tile(patches.count, 2))
-    seen = radius_mm * patches.slopes.ravel()
-    amounts_mm = np.linalg.lstsq(left * weights[:, None], seen * weights, rcond=None)[0]
-    return np.asarray((absorbed - _alike()) @ amounts_mm)
+    answer = (absorbed - _alike()) @ np.linalg.pinv(left * weights[:, None]) * radius_mm
+    return answer @ (patches.slopes.ravel() * weights), slope_variance * float(np.sum(answer**2))
 
 
-def _law(full: FullResult) -> budget.Source:
-    effect = law_effect(budget.Patches.of_grid(full.grid), full.surface.radius_mm, full.fit.normal.inverse)
+def _law(full: FullResult, slope_variance: FloatArray) -> budget.Source:
+    patches, variance = budget.Patches.of_grid(full.grid), float(slope_variance.mean())
+    effect, noise = law_effect(patches, full.surface.radius_mm, full.fit.normal.inverse, variance)
     says = "film that is not Hencky's: round slopes that no term explains"
-    return budget.Source("film_law", says, math.nan, effect[:, None], common=False)
+    return budget.Source("film_law", says, math.nan, effect[:, None], common=False, noise_mm2=noise)
 
 
 @dataclass(frozen=True)
@@ -197,7 +202,8 @@ def examine(
         optics, checked.tracer, state.surface, state.points, places_px, exact, monte_carlo.TRIAL_POINTS
     )
     sigmas = optics.geometry.sigmas or SigmasConfig()
-    film, doubts = _film(bench, spread, checked)
+    moved = FilmMotion.of(checked)
+    film, doubts = _film(bench, spread, moved)
     blur = budget.blur_source(bench, _blur_px(checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
@@ -207,15 +213,16 @@ def examine(
             f"the rim is {outline.offset_mm:.1f} mm off the prediction and {outline.size_ratio:.4f} of its size: "
             "check the camera's pose, the lens and mirror.radius_mm"
         )
+    slope_variance = budget.slope_variance(optics, full, shifts, noise_adu)
     sources = [
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *budget.bench_sources(bench, sigmas),
         *film,
         _vertex(bench, sigmas, checked),
-        _law(full),
+        _law(full, slope_variance),
         blur,
-        *budget.frame_sources(bench, optics, shifts, _film_um(checked)),
-        *budget.pixel_sources(full, budget.slope_variance(optics, full, shifts, noise_adu), noise_adu),
+        *budget.frame_sources(bench, optics, shifts, _film_um(moved), math.hypot(budget.LIGHT, checked.light_left)),
+        *budget.pixel_sources(full, slope_variance, noise_adu),
     ]
     return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
 
@@ -243,21 +250,16 @@ def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked) -> budget
     return budget.vertex_source(bench, math.hypot(noise_um, scale_um), says)
 
 
-def _film_um(checked: Checked) -> float:
-    """RMS motion of the film left in the phases of the frames: what the fringes see, less what was taken out."""
-    readings = checked.stack.readings_um
-    if not motion.worth_correcting(readings, LASER_NOISE_UM):
-        return float(np.sqrt(np.mean(checked.film_um**2)))
-    used = [k for axis in checked.view.used for k in axis]
-    told_um = checked.stack.displacement_um[used] - checked.stack.mean_reading_um
-    return float(np.sqrt(np.mean(np.square(checked.film_um - told_um))))
+def _film_um(film: FilmMotion) -> float:
+    """RMS motion of the film left in the phases of the frames."""
+    return math.hypot(_SEEN_UM, _SEEN_SHARE * film.moved_um) if film.worth_correcting else film.moved_um
 
 
-def _film(bench: TrialBench, spread: GeometrySpread, checked: Checked) -> tuple[list[budget.Source], list[str]]:
+def _film(bench: TrialBench, spread: GeometrySpread, film: FilmMotion) -> tuple[list[budget.Source], list[str]]:
     """The film's motion from x to y: by the laser, else by the fringes."""
-    readings = checked.stack.readings_um
-    if np.isfinite(readings).all():
-        sigma_um = left_by_laser_um(readings, _film_um(checked), LASER_NOISE_UM)
+    if math.isfinite(film.x_to_y_sigma_um):
+        left = _TOLD_SHARE if film.worth_correcting else 1.0
+        sigma_um = math.hypot(film.x_to_y_sigma_um, left * float(film.told_um[0].mean() - film.told_um[1].mean()))
         says = "motion of the film from x to y, by the laser"
         return [budget.film_source(bench, (sigma_um,), says, paired=False)], []
     moved = unseen_motion(bench, spread)
@@ -281,7 +283,7 @@ def left_by_laser_um(readings_um: FloatArray, within_um: float, laser_noise_um: 
     if motion.worth_correcting(readings_um, laser_noise_um):
         return noise_um
     if not np.isfinite(readings_um).all():
-        return _X_TO_Y * within_um
+        return X_TO_Y * within_um
     seen_um = float(np.subtract(*(part.mean() for part in np.split(readings_um, 2))))
-    share = (_X_TO_Y * within_um) ** 2 / ((_X_TO_Y * within_um) ** 2 + noise_um**2)
+    share = (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
     return math.hypot(share * seen_um, math.sqrt(share) * noise_um)

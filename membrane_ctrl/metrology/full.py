@@ -15,7 +15,10 @@ from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
-LASER_NOISE_UM = 1.0  # repeatability of the bench's laser; motion below twice that is not corrected
+LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
+_STILL_UM = 0.2  # standard deviation of the film's place: less is hardly seen, and leaves 0.06 um in the figure
+# motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
+X_TO_Y = 5.0
 _START_SAG_MM = 40.0  # the paper's starting parabola
 # Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
 _LAST_CHANGE_MM = 1e-7
@@ -58,6 +61,45 @@ class FullResult:
 
 
 @dataclass(frozen=True)
+class FilmMotion:
+    """The film during a set, as laser and fringes tell it."""
+
+    told_um: tuple[FloatArray, FloatArray]  # at the used sinusoids of x and of y, about the mean of both
+    x_to_y_sigma_um: float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
+
+    @classmethod
+    def of(cls, checked: Checked, laser_noise_um: float = LASER_NOISE_UM) -> "FilmMotion":
+        """Of a checked set.
+
+        The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre, where the laser's
+        noise is one. Of a difference between the axes they make a figure: there the laser counts, as far as a film
+        that moves so much from frame to frame moves from one axis to the other.
+        """
+        x, y = checked.view.used
+        seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
+        told = [float(checked.stack.displacement_um[used].mean()) for used in (x, y)]
+        sigma_um = laser_noise_um * math.sqrt(1 / len(x) + 1 / len(y))
+        within_um = X_TO_Y * float(np.std(np.concatenate(seen)))
+        share = within_um**2 / (within_um**2 + sigma_um**2)
+        deeper_um = share * (told[0] - told[1]) if math.isfinite(told[0] - told[1]) else 0.0
+        sigma_um = math.sqrt(share) * sigma_um if math.isfinite(told[0] - told[1]) else math.nan
+        # the figure is that of all readings' mean, also where a frame is left out
+        about_um = np.nan_to_num(checked.stack.displacement_um[[*x, *y]].mean() - checked.stack.mean_reading_um)
+        parts = about_um + deeper_um * np.array([len(y), -len(x)]) / (len(x) + len(y))
+        return cls((seen[0] + parts[0], seen[1] + parts[1]), sigma_um)
+
+    @property
+    def moved_um(self) -> float:
+        """RMS motion."""
+        return float(np.std(np.concatenate(self.told_um)))
+
+    @property
+    def worth_correcting(self) -> bool:
+        """Whether the film moved."""
+        return self.moved_um > _STILL_UM
+
+
+@dataclass(frozen=True)
 class PixelPoints:
     """Pixels that see the pattern, with their screen points."""
 
@@ -81,11 +123,12 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
-    moved = motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
-    sensitivity = np.zeros((2, index.size))
+    film = FilmMotion.of(checked)
+    moved, sensitivity = film.worth_correcting, np.zeros((2, index.size))
     if moved:
         sensitivity = motion.sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
-    axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k] if moved else None) for k in range(2)]
+    told_um = film.told_um if moved else (None, None)
+    axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k], told_um[k]) for k in range(2)]
     points.screen_mm[:] = phase.screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
     x, y = tracer.position_mm(points)
@@ -112,16 +155,18 @@ def _axis_phases(
     axis: int,
     index: IntArray,
     in_bin: IntArray,
-    sensitivity: FloatArray | None,
+    sensitivity: FloatArray,
+    told_um: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
-    combined = _combination(checked, axis, None if sensitivity is None else _told_um(checked, axis))
+    combined = _combination(checked, axis, told_um)
     every = stack.sinusoids(phase.AXES[axis])
     # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
-    slope = np.zeros(index.size) if sensitivity is None else sensitivity
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
-    return pixel_phases(frames, stack.design(used), combined, index, slope, reference, 2**optics.camera.bits - 1)
+    return pixel_phases(
+        frames, stack.design(used), combined, index, sensitivity, reference, 2**optics.camera.bits - 1
+    )
 
 
 def reconstruct_full(
@@ -203,21 +248,14 @@ class BinFigure:
     index: IntArray  # (n,): their bins
     sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
     quality: Quality  # for the verdict
-    moved: bool  # whether the film's motion between the frames was corrected
 
 
-def bin_figure(
-    optics: OpticsConfig, checked: Checked, motion_um: tuple[FloatArray, FloatArray] | None = None
-) -> BinFigure:
-    """Phases of the bins, corrected for the film's motion, and the surface fitted to them.
-
-    The motion is that of the used sinusoids of x and of y; by default what the laser saw, if it is worth it.
-    """
-    stack, state, axes = checked.stack, checked.state, range(len(phase.AXES))
-    moved = motion_um is not None or motion.worth_correcting(stack.readings_um, LASER_NOISE_UM)
+def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None = None) -> BinFigure:
+    """Phases of the bins, corrected for the film's motion, and the surface fitted to them."""
+    stack, state, film = checked.stack, checked.state, film or FilmMotion.of(checked)
     sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
-    told_um = motion_um or [_told_um(checked, axis) for axis in axes]
-    steps = [_combination(checked, axis, told_um[axis] if moved else None) for axis in axes]
+    told_um = film.told_um if film.worth_correcting else (None, None)
+    steps = [_combination(checked, axis, told) for axis, told in enumerate(told_um)]
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the combinations
     phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)
@@ -231,12 +269,7 @@ def bin_figure(
     shifts = [stack.shifts_rad(used) for used in checked.view.used]
     sigma = np.stack([phase.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)])
     quality = _quality(optics, checked, fit, float(np.median(swing.min(axis=0))))
-    return BinFigure(fit, points, state.index, scale * sigma, quality, moved)
-
-
-def _told_um(checked: Checked, axis: int) -> FloatArray:
-    """The laser's readings at the usable frames of an axis, about their mean over both."""
-    return np.asarray(checked.stack.displacement_um[checked.view.used[axis]] - checked.stack.mean_reading_um)
+    return BinFigure(fit, points, state.index, scale * sigma, quality)
 
 
 def _combination(checked: Checked, axis: int, motion_um: FloatArray | None) -> phasor.StepCombination:

@@ -1,15 +1,16 @@
 """Correction of the phase for the film's known motion between the frames.
 
 A point's phase at displacement d is phi + q (d - d0), with q = d phi / d d known from the model (a Hencky bowl whose
-sag grows by one micrometre while the ring stays). Frame k then shows A + Re(z exp(i d_k) (1 + i q e_k)) to first
-order in e_k = d(t_k) - d0, where z = B exp(i phi) and d_k is the phase step. With the complex weights
+sag grows by one micrometre while the ring stays). Frame k then shows A + Re(z exp(i d_k) exp(i q e_k)) with
+e_k = d(t_k) - d0, where z = B exp(i phi) and d_k is the phase step. With the complex weights
 w_k = cosine_k + i sine_k of the phase steps (sum w = 0, sum w cos d_k = 1, sum w sin d_k = -i) the estimate is
 
-    z' = z + q sum_k w_k e_k Re(i z exp(i d_k)) = z + i q (turn z - mirror conj z),
-    turn = 1/2 sum w_k e_k exp(i d_k),   mirror = 1/2 sum w_k e_k exp(-i d_k),
+    z' = T z + M conj z,   T = 1 + i q turn - q^2 turn_2 / 2,   M = -i q mirror - q^2 mirror_2 / 2,
+    turn_n = 1/2 sum w_k e_k^n exp(i d_k),   mirror_n = 1/2 sum w_k e_k^n exp(-i d_k),
 
-so z = z' - i q (turn z' - mirror conj z') to first order. A constant e gives turn = e and mirror = 0: a plain shift
-of phase. Counting e from one d0 for both axes therefore also brings x and y, taken at different times, to one moment.
+to second order, so z = (conj T z' - M conj z') / (|T|^2 - |M|^2). A constant e gives turn = e and mirror = 0: a plain
+shift of phase. Counting e from one d0 for both axes therefore also brings x and y, taken at different times, to one
+moment.
 """
 
 from dataclasses import dataclass
@@ -38,9 +39,8 @@ def combine_steps(
     if motion_um is None:
         return phasor.StepCombination(cosine, sine)
     # of a phasor per pixel: the bin's area cancels
-    moved = (weights[1] + 1j * weights[2]) * motion_um / 2
-    turn, mirror = (complex(moved @ np.exp(sign * 1j * shifts_rad)) for sign in (1, -1))
-    return phasor.StepCombination(cosine, sine, turn, mirror)
+    moved = (weights[1] + 1j * weights[2]) / 2 * motion_um ** np.array([[1], [2]])
+    return phasor.StepCombination(cosine, sine, *(moved @ np.exp(sign * 1j * shifts_rad) for sign in (1, -1)))
 
 
 def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:

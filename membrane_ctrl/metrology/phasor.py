@@ -7,12 +7,12 @@ is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phas
 
 import math
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split, step
-from membrane_ctrl.model.arrays import AnyArray, FloatArray, Image, IntArray
+from membrane_ctrl.model.arrays import AnyArray, ComplexArray, FloatArray, Image, IntArray
 
 _BLOCK = 512
 _NEVER = np.uint32(2**32 - 1)  # above any pixel
@@ -149,9 +149,9 @@ class StepCombination:
 
     cosine: FloatArray  # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
     sine: FloatArray  # (N,)
-    # First-order effect of the film's motion per radian and unit of sensitivity (see `motion`); 0 without
-    turn: complex = 0j
-    mirror: complex = 0j
+    # (2,) first and second moment of the film's motion (see `motion`); 0 without
+    turn: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
+    mirror: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
 
 
 @step
@@ -186,13 +186,20 @@ def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
             out[p] += weight * sums[k, index[first + p]]
 
 
+@step
+def still(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
+    """The phasor c + i s without the film's motion, to second order (see `motion`)."""
+    half = q * q / 2
+    t_re, t_im = 1 - q * turn[0].imag - half * turn[1].real, q * turn[0].real - half * turn[1].imag
+    m_re, m_im = q * mirror[0].imag - half * mirror[1].real, -q * mirror[0].real - half * mirror[1].imag
+    scale = 1 / (t_re * t_re + t_im * t_im - m_re * m_re - m_im * m_im)
+    return scale * ((t_re - m_re) * c + (t_im - m_im) * s), scale * ((t_re + m_re) * s - (t_im + m_im) * c)
+
+
 @kernel
-def _still(c, s, slope, turn_real, turn_imag, mirror_real, mirror_imag):  # type: ignore[no-untyped-def]
-    """z - i q (turn z - mirror conj z) in place: corrects the film's motion to first order (see `motion`)."""
+def _still(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
     for p in range(c.size):
-        u = turn_real * c[p] - turn_imag * s[p] - mirror_real * c[p] - mirror_imag * s[p]
-        v = turn_real * s[p] + turn_imag * c[p] - mirror_imag * c[p] + mirror_real * s[p]
-        c[p], s[p] = c[p] + slope[p] * v, s[p] - slope[p] * u
+        c[p], s[p] = still(c[p], s[p], slope[p], turn, mirror)
 
 
 @kernel
@@ -216,8 +223,8 @@ def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, sto
         c, s = out[1, first:end], out[2, first:end]
         _combine(sums, index, cosine, first, c)
         _combine(sums, index, sine, first, s)
-        if turn != 0 or mirror != 0:
-            _still(c, s, slope[first:end], turn.real, turn.imag, mirror.real, mirror.imag)
+        if turn[1] != 0:
+            _still(c, s, slope[first:end], turn, mirror)
         _angle(c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end])
         for p in range(first, end):
             out[0, p] = last[0, p] + out[3, p]

@@ -161,13 +161,14 @@ def equations(
     common: FloatArray,
     references: References,
     trust: Trust,
+    deeper: FloatArray | None = None,
 ) -> Equations:
-    """Linearise one set; `common` (COMMON,) are parameters and ring."""
+    """Linearise one set; `common` (COMMON,) are parameters and ring, `deeper` is that of `residuals.chunks`."""
     sums = np.zeros((residuals.LOCAL + COMMON + 1,) * 2)
     keep = np.append(np.arange(residuals.COLUMNS), residuals.LOCAL + COMMON)
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
     residual = np.empty_like(phases.screen_mm)
-    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm):
+    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm, deeper):
         residual[:, part.place] = part.residual_mm
         for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
             sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])
@@ -187,7 +188,7 @@ def _reference_rows(
     if phases.artefact is not None:
         return _artefact_rows(phases.artefact, state)
     rows = np.zeros((RING + 2, residuals.LOCAL + COMMON + 1))
-    rows[-1, residuals.MOTION], rows[-1, -1] = 1.0, -state.motion_mm
+    rows[-1, residuals.MOTION], rows[-1, -1] = 1.0, 1e-3 * phases.motion_um - state.motion_mm
     rows[-1] /= max(phases.motion_sigma_um, _STILL_UM) * 1e-3
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()

@@ -8,7 +8,7 @@ import numpy as np
 from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.metrology.phase import AXES, step_design, step_weights
-from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2
+from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2, still
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
 _ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
@@ -135,11 +135,7 @@ def _phases(frames, index, weights, design, turn, mirror, slope, reference, limi
         for k in range(steps):
             left = float(frames[k, place]) - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
-        # z - i q (turn z - mirror conj z): corrects the film's motion between the frames (see `motion`)
-        q = slope[p]
-        u = turn.real * c - turn.imag * s - mirror.real * c - mirror.imag * s
-        v = turn.real * s + turn.imag * c - mirror.imag * c + mirror.real * s
-        c, s = c + q * v, s - q * u
+        c, s = still(c, s, slope[p], turn, mirror)
         wrapped = arctan2(s, c)
         reference[p] = wrapped + 2 * math.pi * math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
         swing = math.sqrt(c * c + s * s)

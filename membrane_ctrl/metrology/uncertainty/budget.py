@@ -45,11 +45,27 @@ class Source:
     effects_mm: FloatArray  # (36, k): independent changes of the parameters, of 1 sigma each, from this input
     common: bool = True  # whether all sets of a bench share it
     paired: bool = True  # whether two sets have the same error in the same column: it cancels in a change
+    noise_mm2: float = 0.0  # sum of squares of noise in effects that the set shows: the noise has a row of its own
+
+    @property
+    def known_mm(self) -> FloatArray:
+        """The effects beyond that noise."""
+        share = 1 - self.noise_mm2 / max(float(np.sum(self.effects_mm**2)), 1e-300)
+        return np.asarray(math.sqrt(max(share, 0.0)) * self.effects_mm)
 
     @property
     def covariance_mm2(self) -> FloatArray:
         """(36, 36) of the parameters."""
-        return np.asarray(self.effects_mm @ self.effects_mm.T)
+        return np.asarray(self.known_mm @ self.known_mm.T)
+
+    def change(self, earlier: "Source | None") -> list[FloatArray]:
+        """Effects on the change since an earlier set."""
+        if earlier is None:
+            return [self.known_mm]
+        if not (self.paired and earlier.paired):
+            return [self.known_mm, earlier.known_mm]
+        noise_mm2 = self.noise_mm2 + earlier.noise_mm2
+        return [replace(self, effects_mm=self.effects_mm - earlier.effects_mm, noise_mm2=noise_mm2).known_mm]
 
 
 @dataclass(frozen=True)
@@ -72,12 +88,8 @@ class Budget:
         before = {source.name: source for source in earlier.sources}
         parts = [np.zeros((PARAMETERS, 1))]
         for own in self.sources:
-            other = before.pop(own.name, None)
-            if other is not None and own.paired and other.paired:
-                parts.append(own.effects_mm - other.effects_mm)
-            else:
-                parts += [own.effects_mm, *([] if other is None else [other.effects_mm])]
-        effects = np.concatenate([*parts, *(left.effects_mm for left in before.values())], axis=1)
+            parts += own.change(before.pop(own.name, None))
+        effects = np.concatenate([*parts, *(left.known_mm for left in before.values())], axis=1)
         return np.asarray(effects @ effects.T)
 
     def rows(self) -> list[dict[str, Any]]:
@@ -281,12 +293,13 @@ def frame_effects(
 
 
 def frame_sources(
-    bench: TrialBench, optics: OpticsConfig, shifts_rad: Sequence[FloatArray], film_um: float
+    bench: TrialBench, optics: OpticsConfig, shifts_rad: Sequence[FloatArray], film_um: float, light: float
 ) -> Iterator[Source]:
-    """What differs from frame to frame: the light, known to `LIGHT` only, and the film, off by `film_um`."""
+    """What differs from frame to frame: the light, by `light`, and the film, by `film_um`."""
     effects = frame_effects(bench, optics, shifts_rad)
-    light = LIGHT * (effects.level + effects.swing)
-    yield Source("light_relative", "light of each frame", LIGHT, light, False, False)
+    yield Source(
+        "light_relative", "light of each frame", light, light * (effects.level + effects.swing), False, False
+    )
     says = "motion of the film from frame to frame that no laser has told"
     yield Source("film_um", says, film_um, film_um * effects.film, False, False)
 
@@ -298,10 +311,9 @@ def pixel_sources(full: FullResult, slope_variance: FloatArray, noise_adu: float
     noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
     left = Patches.of_grid(full.grid).effects(full.surface.radius_mm, inverse)
-    share = max(0.0, 1 - float(np.sum(noise**2)) / max(float(np.sum(left**2)), 1e-300))
     left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
-    yield Source("slope_urad", says, left_urad, math.sqrt(share) * left, common=False)
+    yield Source("slope_urad", says, left_urad, left, common=False, noise_mm2=float(np.sum(noise**2)))
 
 
 @dataclass(frozen=True)

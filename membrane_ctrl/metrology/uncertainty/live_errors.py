@@ -221,7 +221,7 @@ class ErrorWatch:
         field = tracer.slope_field(state.points, fit.surface)
         reach_mm, slopes = self._optics.mirror.analysis_radius_mm, field[2:4] - field[4:6]
         patches = budget.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
-        law = consistency.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
+        law, _ = consistency.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
         left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
         levels = [w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)]
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
