@@ -13,7 +13,6 @@ from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, c
 from membrane_ctrl.metrology.frames import frame_stack, integrity
 from membrane_ctrl.metrology.frequencies import check_frequencies
 from membrane_ctrl.metrology.full import BinFigure, FullResult, bin_figure, measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.reconstruct import HeightFunction
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
 
@@ -52,39 +51,37 @@ class Measurement:
         return [{"file": self.head.files[flag.frame], "reason": flag.reason} for flag in self.flags]
 
 
-def measure_set(
-    folder: str | Path,
-    geometry: GeometryFile | None = None,
-    anchor: Anchor | None = None,
-    start: HeightFunction | None = None,
-) -> Measurement:
-    """Measure one set.
+def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Measurement:
+    """Measure one set, whatever its frames show; `geometry` replaces the set's own.
 
-    Parameters
-    ----------
-    folder : str or Path
-        The set.
-    geometry : GeometryFile, optional
-        Replaces the set's own.
-    anchor : Anchor, optional
-        For a fringes set: its reference, if already read (see `read_anchor`).
-    start : height function, optional
-        Starting shape of the fit.
-
-    Raises
-    ------
-    InputError
-        If the set or its reference is invalid.
+    Raises InputError if the set or its reference is invalid.
     """
     begin = time.perf_counter()
-    capture = read_set(folder, geometry)
+    capture, anchor = read_set(folder, geometry), None
     where = capture.head.folder / "capture.toml" if geometry is None else geometry.path
     require_plausible(capture.head.optics, where, depth_known=False)  # the set need not know its film's depth
     if capture.head.reference is not None:
-        reference, own = read_anchor(capture.head.reference, geometry)
-        anchor = anchor or own
+        reference, anchor = read_anchor(capture.head.reference, geometry)
         capture = replace(capture, head=anchored(capture.head, reference))
-    return measure_capture(capture, anchor, start, load_s=time.perf_counter() - begin)
+    optics, loaded = capture.head.optics, time.perf_counter()
+    try:
+        checked = checked_set(capture, anchor)
+    except RejectedSetError as error:
+        timing = {"load": loaded - begin, "phase": time.perf_counter() - loaded, "reconstruct": 0.0}
+        mean_um = capture.head.mean_reading_um
+        return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
+    pixels = measure_pixels(optics, checked)
+    middle = time.perf_counter()
+    full = reconstruct_full(optics, checked, pixels)
+    end = time.perf_counter()
+    verdict, reason = shape_estimate.judge(full.quality)
+    if verdict == "ok":
+        verdict, reason = checked.verdict
+    timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
+    stack = checked.stack
+    none = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)  # what follows needs no frames: they are large
+    checked = replace(checked, stack=replace(stack, frames=none))
+    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing)
 
 
 def read_anchor(folder: str | Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
@@ -118,32 +115,6 @@ def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if they give no figure."""
     stack, optics = stack_of(capture), capture.head.optics
     return check_frequencies(stack, optics) if capture.head.kind == "frequencies" else check(stack, optics, anchor)
-
-
-def measure_capture(
-    capture: CaptureSet, anchor: Anchor | None = None, start: HeightFunction | None = None, load_s: float = 0.0
-) -> Measurement:
-    """Measure frames in memory; never raises, whatever they show."""
-    optics = capture.head.optics
-    begin = time.perf_counter()
-    try:
-        checked = checked_set(capture, anchor)
-    except RejectedSetError as error:
-        timing = {"load": load_s, "phase": time.perf_counter() - begin, "reconstruct": 0.0}
-        mean_um = capture.head.mean_reading_um
-        return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
-    pixels = measure_pixels(optics, checked)
-    middle = time.perf_counter()
-    full = reconstruct_full(optics, checked, pixels, start)
-    end = time.perf_counter()
-    verdict, reason = shape_estimate.judge(full.quality)
-    if verdict == "ok":
-        verdict, reason = checked.verdict
-    timing = {"load": load_s, "phase": middle - begin, "reconstruct": end - middle}
-    stack = checked.stack
-    none = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)  # what follows needs no frames: they are large
-    checked = replace(checked, stack=replace(stack, frames=none))
-    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing)
 
 
 def noise_seen_adu(measurement: Measurement) -> float:

@@ -24,6 +24,7 @@ _ROUNDS = 8
 _MANY_BLAMED = 3
 # Below, the light is called even: it leaves 0.02 um in the figure, and a blurred set seems to differ by as much.
 _UNEVEN = 2e-3
+_BLURRED_RAD = 2.0  # from the pattern's edge: a blurred picture of it says nothing of a frame's light
 _LIGHT_KNOWN = 3e-4  # what another round would change, once it is not even
 # A point whose phase moved further than this between two sets may have been taken for its neighbour a period away
 _GUARD_RAD = 0.9 * math.pi
@@ -173,7 +174,9 @@ def _check(
         flags = integrity.inspect(stack, seen, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
-            light, film_um = evidence.light_and_film(stack, binned, attempt.scene, attempt.view.used)
+            inner = inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD).all(axis=0)
+            scene, flat = attempt.scene.part(inner), attempt.phase_rad.reshape(2, -1)
+            light, film_um = evidence.light_and_film(stack, binned, scene, attempt.view.used, flat)
             left = light - (1.0 if stack.light is None else stack.light)
             if np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN) and done < rounds:
                 stack = replace(stack, light=light)  # a round with the light that each frame had

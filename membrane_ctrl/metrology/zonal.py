@@ -8,8 +8,8 @@ of their slopes (Southwell's model); least squares over all pairs of neighbours 
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.ndimage import label
 
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.model.arrays import FloatArray
@@ -253,7 +253,7 @@ def integrate(grid: ResidualGrid) -> FloatArray:
     rhs[:, 1:] += rise_x[:, :-1]
     rhs[1:] += rise_y[:-1]
     height = MaskedLaplacian(right, down).solve(rhs)
-    parts, _ = label(seen)
+    _, parts = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
     means = np.bincount(parts.ravel(), height.ravel()) / np.maximum(np.bincount(parts.ravel()), 1)
     height = np.where(seen, height - means[parts], np.nan)
     return height - _at_vertex(height)

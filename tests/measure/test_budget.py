@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.coverage import BentRays
+from benchmarks.coverage import BentRays, answers
 from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
@@ -20,6 +21,7 @@ from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
+from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
@@ -178,6 +180,41 @@ def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:
     own = next(row for row in found.examined.budget.rows() if row["name"] == "film_x_to_y_um")
     assert found.height_um == pytest.approx(own["height_rms_um"], rel=0.15)
     assert found.height_um > 15
+
+
+def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
+    """Two sets show the same slopes, each with its noise: nothing of their row is left in the change between them."""
+    rng = np.random.default_rng(1)
+    shown = 1e-4 * rng.standard_normal((36, 400))
+
+    def row(noise_mm: float, grown: float) -> Source:
+        effects = grown * shown + noise_mm * rng.standard_normal(shown.shape)
+        return Source("slope_urad", "", 1.0, effects, common=False, noise_mm2=noise_mm**2 * shown.size)
+
+    one, same, other = row(3e-5, 1.0), row(3e-5, 1.0), row(3e-5, 1.2)
+    square = float(np.sum(shown**2))
+    assert np.trace(one.covariance_mm2) == pytest.approx(square, rel=0.02)
+    left, grown = (
+        np.trace(Budget((later,), 0.95).change_covariance(Budget((one,), 0.95))) for later in (same, other)
+    )
+    assert left < 0.01 * square  # with its noise 0.18
+    assert grown == pytest.approx(0.04 * square, rel=0.2)
+
+
+def test_a_benchmark_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+    asked: list[int] = []
+
+    def bench(seed: int) -> dict[str, int]:
+        asked.append(seed)
+        return {"seed": seed, "square": seed**2}
+
+    path = tmp_path / "answers.jsonl"
+    whole = answers(path, 5, bench)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text[: text.index('"square": 9') + 4], encoding="utf-8")  # in the middle of the fourth line
+    assert answers(path, 5, bench) == whole
+    assert asked == [0, 1, 2, 3, 4, 3, 4]
+    assert path.read_text(encoding="utf-8") == text
 
 
 @pytest.mark.campaign

@@ -82,6 +82,24 @@ def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -
     assert finding.says.startswith(says)
 
 
+@pytest.mark.parametrize(
+    ("edit", "which", "says"),
+    [
+        (reading(lambda d: d + 50), (1,), "the film moved by 9 um RMS while set1 was taken: hold it still"),
+        (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
+    ],
+)
+def test_a_film_that_moved_is_named_alone_unless_the_still_sets_have_a_cause(
+    edit: Edit, which: tuple[int, ...], says: str
+) -> None:
+    sets = list(edited(edit, *which))
+    sets[1] = replace(sets[1], moved_um=9.0)
+    (finding,) = judged(good(), tuple(sets))
+    assert finding.fatal
+    assert finding.says.startswith(says)
+    assert "or:" not in finding.says
+
+
 def test_sets_that_are_too_close_are_refused() -> None:
     (finding,) = judged(make(VALUES, 3, points=800, sags_mm=(36.8, 37.0, 37.2)))
     assert finding.fatal

@@ -144,18 +144,13 @@ def chunks(
     surface: Surface,
     vertex_z_mm: float,
     motion_mm: float = 0.0,
-    deeper: FloatArray | None = None,
 ) -> Iterator[Chunk]:
-    """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there.
-
-    `deeper` (36,) is the change of the film's parameters by 1 mm of sag, by default that of Hencky's bowl.
-    """
-    deeper = hencky_deeper() if deeper is None else deeper
+    """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
     for part in _parts(points.t_mm.size):
         meet = _meet(bench, points, surface, part)
         lens = lens_derivatives(bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray)
-        derivatives = _derivatives(bench, turns, surface, meet, lens, deeper)
+        derivatives = _derivatives(bench, turns, surface, meet, lens)
         # it is small enough to be linear
         predicted = meet.screen_mm / bench.pitch + motion_mm * derivatives[:, MOTION]
         yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
@@ -201,7 +196,7 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -
 
 
 def _derivatives(
-    bench: BenchGeometry, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray, deeper: FloatArray
+    bench: BenchGeometry, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray
 ) -> FloatArray:
     """(2, COLUMNS, m) by the formulas above, right to left: the effect on s of a change of P, u, n, d."""
     geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
@@ -227,8 +222,8 @@ def _derivatives(
         by_terms = by_height[axis] * height - slope
         out[axis, :PARAMETERS], out[axis, BEYOND] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
-    moves = np.einsum("j,ajm->am", deeper, out[:, :PARAMETERS]) - by_height
-    out[0, MOTION], out[1, MOTION] = moves[0] / 2, -moves[1] / 2
+    deeper = np.einsum("j,ajm->am", _deeper(), out[:, :PARAMETERS]) - by_height
+    out[0, MOTION], out[1, MOTION] = deeper[0] / 2, -deeper[1] / 2
     in_camera = geometry.rotation @ d
     for j, turn in enumerate(turns):
         moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
@@ -246,8 +241,8 @@ def _derivatives(
 
 
 @cache
-def hencky_deeper() -> FloatArray:
-    """Change (36,) of a bowl's parameters by 1 mm of sag; the vertex goes down by as much."""
+def _deeper() -> FloatArray:
+    """Change (36,) of the surface's parameters by 1 mm of sag; the vertex goes down by as much."""
     return Surface.hencky_bowl(1.0, 1.0).parameters
 
 

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from membrane_ctrl.metrology.calibrate import parameters
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, usual_sigma
-from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline, light_at
 from membrane_ctrl.metrology.reconstruct import HeightFunction
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -127,7 +126,7 @@ def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
     normal *= np.sign(np.sum(normal * (ellipse - ellipse.mean(axis=1, keepdims=True)), axis=0))
     reach = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2, _STEP_PX)
     lines = ellipse[:, :, None] + normal[:, :, None] * reach
-    values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
+    values = light_at(light, lines)
     ends = reach.size // 4
     inside, outside = np.median(values[:, :ends], axis=1), np.median(values[:, -ends:], axis=1)
     half = (inside + outside) / 2

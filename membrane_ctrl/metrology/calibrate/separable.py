@@ -161,14 +161,13 @@ def equations(
     common: FloatArray,
     references: References,
     trust: Trust,
-    deeper: FloatArray | None = None,
 ) -> Equations:
-    """Linearise one set; `common` (COMMON,) are parameters and ring, `deeper` is that of `residuals.chunks`."""
+    """Linearise one set; `common` (COMMON,) are parameters and ring."""
     sums = np.zeros((residuals.LOCAL + COMMON + 1,) * 2)
     keep = np.append(np.arange(residuals.COLUMNS), residuals.LOCAL + COMMON)
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
     residual = np.empty_like(phases.screen_mm)
-    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm, deeper):
+    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm):
         residual[:, part.place] = part.residual_mm
         for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
             sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])

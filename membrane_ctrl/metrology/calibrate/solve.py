@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, sag_gradient
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
@@ -31,7 +31,6 @@ _NEARLY = 0.1  # likewise: the next step is far below the noise
 _FEW = 4000  # points of a set: a hundred times its unknowns
 _FURTHEST = 4.0  # in sigmas of the hand measurements; sets that contradict each other would lead out of the room
 _START_SAG_MM = 40.0
-_LEAST_SPREAD_MM = 0.5  # of the sags, to see how the film deepens
 _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
 
@@ -189,12 +188,8 @@ def _linearise(
 ) -> tuple[separable.Equations, ...]:
     values = common[: len(parameters.NAMES)]
     bench, turns = parameters.bench_at(problem.stated, values), parameters.pose_derivatives(problem.stated, values)
-    # how this film deepens, as its sets show it
-    films = np.stack([states[k].surface.parameters for k in problem.films])
-    off_mm = (films - films.mean(axis=0)) @ sag_gradient()
-    deeper = off_mm @ films / (off_mm @ off_mm) if np.ptp(off_mm) > _LEAST_SPREAD_MM else None
     return tuple(
-        separable.equations(bench, turns, phases, state, common, problem.references, believed, deeper)
+        separable.equations(bench, turns, phases, state, common, problem.references, believed)
         for phases, state, believed in zip(problem.sets, states, trust, strict=True)
     )
 

@@ -19,7 +19,7 @@ _FEW_POINTS = 500  # of a set: ten times its unknowns
 _SCATTER = 3.0  # times the others' noise
 # with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 um
 _HARMLESS_UM = 2.5
-# a correction leaves a tenth of the motion, as ripples of half a fringe: more than the noise
+# a correction leaves some hundredths of the motion: in a blurred picture more than the noise
 _STEADY_UM = 4.0
 
 
@@ -69,18 +69,30 @@ def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     if not solution.converged:
         return (film[0][1] if film else _astray(solution),)
     causes = [*film, *_sets(solution), *_laser(solution), *_model(solution)]
-    cause = [_moving(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
+    cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
     return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
 
 
-def _moving(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
-    """The finding, with the motion of a film that moved so much that its correction may be the cause."""
+def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
+    """The finding; where the film moved much in some sets, that of the others, or its motion if they have none."""
     sets = solution.problem.sets
-    most = max(finding.sets or range(len(sets)), key=lambda k: sets[k].moved_um)
-    if sets[most].moved_um < _STEADY_UM:
+    moved = [k for k, phases in enumerate(sets) if phases.moved_um >= _STEADY_UM]
+    if not moved:
         return finding
-    says = f"or: the film moved by {sets[most].moved_um:.0f} um RMS while {sets[most].name} was taken: hold it still"
-    return replace(finding, says=f"{finding.says}; {says}")
+    causes, rest = [], solution
+    if len(solution.problem.films) - len(moved) > 1:
+        for k in reversed(moved):
+            rest = diagnose.without(rest, k)
+        causes = [*_sets(rest), *_laser(rest), *_model(rest)]
+    if causes:
+        still = [k for k in range(len(sets)) if k not in moved]
+        found = max(causes, key=lambda each: each[0])[1]
+        return replace(found, sets=tuple(still[k] for k in found.sets))
+    most = sets[max(moved, key=lambda k: sets[k].moved_um)]
+    says = (
+        f"the film moved by {most.moved_um:.0f} um RMS while {most.name} was taken: hold it still, and take it anew"
+    )
+    return CalibrationFinding(True, says, tuple(moved))
 
 
 def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:

@@ -12,7 +12,7 @@ belong there.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,9 +37,12 @@ class SampledBins:
 
     def thinned(self) -> "SampledBins":
         """Enough of the bins."""
-        every = slice(None, None, max(1, self.index.size // _SAMPLE))
-        of_axes = self.phase_rad[:, every], self.sensitivity_rad_per_um[:, every]
-        return SampledBins(self.index[every], self.light[every], *of_axes)
+        return self.part(slice(None, None, max(1, self.index.size // _SAMPLE)))
+
+    def part(self, which: slice | BoolArray) -> "SampledBins":
+        """Some of the bins."""
+        of_axes = self.phase_rad[:, which], self.sensitivity_rad_per_um[:, which]
+        return SampledBins(self.index[which], self.light[which], *of_axes)
 
 
 @dataclass(frozen=True)
@@ -72,20 +75,31 @@ def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list
 
 
 def light_and_film(
-    stack: FrameStack, binned: Binned, scene: SampledBins, used: tuple[list[int], list[int]]
+    stack: FrameStack, binned: Binned, scene: SampledBins, used: tuple[list[int], list[int]], phase_rad: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Level and swing (2, frames) of the used sinusoids about the mean of their axis, and the film's places in um.
 
     Places are those of the used sinusoids of x and then of y. Each frame is compared with the light that the other
-    axis saw: in that of its own axis it leaves waves, which would hide a tenth of what differs.
+    axis saw: in that of its own axis it leaves waves, which would hide a tenth of what differs. Phases `phase_rad`
+    (2, bins) that differ smoothly from the surface's (a film that moved between the axes, a wrong geometry) and a
+    contrast that differs over the mirror (blur) would be taken for both.
     """
     scene, light, film_um = scene.thinned(), np.ones((2, len(stack.patterns))), np.empty(0)
     told_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
+    u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / scene.phase_rad.std(axis=1)[:, None]
+    smooth = np.stack([u**p * v**q for p in range(4) for q in range(4 - p)])
+    left = (phase_rad[:, scene.index] - scene.phase_rad) @ np.linalg.pinv(smooth)
+    scene, contrast = (
+        replace(scene, phase_rad=scene.phase_rad + left @ smooth),
+        smooth[1:] - smooth[1:].mean(axis=1)[:, None],
+    )
+    means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     for own, others in (used, used[::-1]):
-        means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
-        aside = stack.weights(others)[0] @ means[others]
-        templates = [_template(stack, scene, k, float(told_um[k])) for k in own]
-        found = [_evidence(means[k], each, aside, 0.0, k) for k, each in zip(own, templates, strict=True)]
+        aside, found = stack.weights(others)[0] @ means[others], []
+        for k in own:
+            template = _template(stack, scene, k, float(told_um[k]))
+            columns = np.vstack([template.columns, template.columns[1] * contrast])
+            found.append(_evidence(means[k], replace(template, columns=columns), aside, 0.0, k))
         seen = np.array([[each.level, each.swing] for each in found]).T
         light[:, own] = seen / seen.mean(axis=1, keepdims=True)
         film_um = np.append(film_um, told_um[own] + [each.moved_um for each in found])

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import OpticsConfig
@@ -237,6 +236,16 @@ class Outline:
     size_ratio: float  # seen over expected, mean radius
 
 
+def light_at(light: FloatArray, places_px: FloatArray) -> FloatArray:
+    """Light (H, W) between pixels, at columns and rows (2, ...); NaN outside. SciPy's would load for 0.2 s."""
+    far = np.array(light.shape[::-1]).reshape(2, *[1] * (places_px.ndim - 1)) - 1
+    inside = ((places_px >= 0) & (places_px <= far)).all(axis=0)
+    column, row = low = np.clip(np.floor(np.where(inside, places_px, 0.0)), 0, far - 1).astype(int)
+    right, down = places_px - low
+    upper, lower = ((1 - right) * light[k, column] + right * light[k, column + 1] for k in (row, row + 1))
+    return np.where(inside, (1 - down) * upper + down * lower, np.nan)
+
+
 def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm: float) -> Outline | None:
     """Look for the rim.
 
@@ -258,7 +267,7 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     middle = expected.mean(axis=1)
     reach = np.linspace(_FROM, _TO, _SAMPLES)
     lines = middle[:, None, None] + (expected - middle[:, None])[:, :, None] * reach
-    values = map_coordinates(light, [lines[1], lines[0]], order=1, mode="constant", cval=np.nan)
+    values = light_at(light, lines)
     whole = np.isfinite(values).all(axis=1)  # a line that leaves the picture is not used
     inside = np.where(whole, np.median(values[:, :10], axis=1), 0.0)
     below = values < inside[:, None] / 2
