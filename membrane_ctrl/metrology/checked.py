@@ -174,8 +174,9 @@ def _check(
         flags = integrity.inspect(stack, seen, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
-            inner = inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD).all(axis=0)
-            scene, flat = attempt.scene.part(inner), attempt.phase_rad.reshape(2, -1)
+            inner = np.all(inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)
+            scene = attempt.scene.part(inner) if np.mean(inner) > 1 / 2 else attempt.scene
+            flat = attempt.phase_rad.reshape(2, -1)
             light, film_um = evidence.light_and_film(stack, binned, scene, attempt.view.used, flat)
             left = light - (1.0 if stack.light is None else stack.light)
             if np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN) and done < rounds:

@@ -10,7 +10,7 @@ from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
 from membrane_ctrl.metrology import motion
 from membrane_ctrl.metrology.calibrate import residuals
 from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.full import LASER_NOISE_UM, X_TO_Y, FilmMotion, FullResult
+from membrane_ctrl.metrology.full import LASER_NOISE_UM, X_TO_Y, FilmMotion, FullResult, motion_share
 from membrane_ctrl.metrology.optics.geometry import Outline, project
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, sag_gradient
 from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
@@ -285,5 +285,5 @@ def left_by_laser_um(readings_um: FloatArray, within_um: float, laser_noise_um: 
     if not np.isfinite(readings_um).all():
         return X_TO_Y * within_um
     seen_um = float(np.subtract(*(part.mean() for part in np.split(readings_um, 2))))
-    share = (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
+    share = motion_share(within_um, noise_um)
     return math.hypot(share * seen_um, math.sqrt(share) * noise_um)

@@ -60,6 +60,11 @@ class FullResult:
         return SurfaceMap(grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y)
 
 
+def motion_share(within_um: float, noise_um: float) -> float:
+    """Share of what a laser tells of the motion from x to y that is motion, if it is so large within an axis."""
+    return (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
+
+
 @dataclass(frozen=True)
 class FilmMotion:
     """The film during a set, as laser and fringes tell it."""
@@ -68,7 +73,7 @@ class FilmMotion:
     x_to_y_sigma_um: float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
 
     @classmethod
-    def of(cls, checked: Checked, laser_noise_um: float = LASER_NOISE_UM) -> "FilmMotion":
+    def of(cls, checked: Checked) -> "FilmMotion":
         """Of a checked set.
 
         The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre, where the laser's
@@ -77,16 +82,13 @@ class FilmMotion:
         """
         x, y = checked.view.used
         seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
-        told = [float(checked.stack.displacement_um[used].mean()) for used in (x, y)]
-        sigma_um = laser_noise_um * math.sqrt(1 / len(x) + 1 / len(y))
-        within_um = X_TO_Y * float(np.std(np.concatenate(seen)))
-        share = within_um**2 / (within_um**2 + sigma_um**2)
-        deeper_um = share * (told[0] - told[1]) if math.isfinite(told[0] - told[1]) else 0.0
-        sigma_um = math.sqrt(share) * sigma_um if math.isfinite(told[0] - told[1]) else math.nan
+        readings_um, noise_um = checked.stack.displacement_um, LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
+        x_to_y_um = float(readings_um[x].mean() - readings_um[y].mean())
+        share = motion_share(float(np.std(np.concatenate(seen))), noise_um)
         # the figure is that of all readings' mean, also where a frame is left out
-        about_um = np.nan_to_num(checked.stack.displacement_um[[*x, *y]].mean() - checked.stack.mean_reading_um)
-        parts = about_um + deeper_um * np.array([len(y), -len(x)]) / (len(x) + len(y))
-        return cls((seen[0] + parts[0], seen[1] + parts[1]), sigma_um)
+        about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
+        parts = np.nan_to_num(about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y)))
+        return cls((seen[0] + parts[0], seen[1] + parts[1]), math.sqrt(share) * noise_um + 0 * x_to_y_um)
 
     @property
     def moved_um(self) -> float:

@@ -211,7 +211,7 @@ def screen_mm(absolute_rad: FloatArray, pattern: PatternConfig) -> FloatArray:
 
 def inside_pattern(absolute_rad: FloatArray, pattern: PatternConfig, margin_rad: float = 0.0) -> BoolArray:
     """Whether the phase lies in the pattern; one from a wrong Gray bit at its rim does not."""
-    return np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods - margin_rad
+    return np.asarray(np.abs(absolute_rad - centre_phase_rad(pattern)) <= math.pi * pattern.periods - margin_rad)
 
 
 # The images of a measurement cycle, in their order on the screen and in the memory.

@@ -85,9 +85,7 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
             rest = diagnose.without(rest, k)
         causes = [*_sets(rest), *_laser(rest), *_model(rest)]
     if causes:
-        still = [k for k in range(len(sets)) if k not in moved]
-        found = max(causes, key=lambda each: each[0])[1]
-        return replace(found, sets=tuple(still[k] for k in found.sets))
+        return replace(max(causes, key=lambda each: each[0])[1], sets=())
     most = sets[max(moved, key=lambda k: sets[k].moved_um)]
     says = (
         f"the film moved by {most.moved_um:.0f} um RMS while {most.name} was taken: hold it still, and take it anew"

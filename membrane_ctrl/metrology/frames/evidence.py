@@ -22,6 +22,7 @@ from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLE = 6_000
+_SEVERAL_RAD = 6.0  # standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
 _EDGE_RAD = 0.5
 
@@ -86,13 +87,13 @@ def light_and_film(
     """
     scene, light, film_um = scene.thinned(), np.ones((2, len(stack.patterns))), np.empty(0)
     told_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
-    u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / scene.phase_rad.std(axis=1)[:, None]
-    smooth = np.stack([u**p * v**q for p in range(4) for q in range(4 - p)])
+    spread_rad = scene.phase_rad.std(axis=1)
+    u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread_rad[:, None]
+    order = 4 if spread_rad.min() > _SEVERAL_RAD else 1
+    smooth = np.stack([u**p * v**q for p in range(order) for q in range(order - p)])
     left = (phase_rad[:, scene.index] - scene.phase_rad) @ np.linalg.pinv(smooth)
-    scene, contrast = (
-        replace(scene, phase_rad=scene.phase_rad + left @ smooth),
-        smooth[1:] - smooth[1:].mean(axis=1)[:, None],
-    )
+    scene = replace(scene, phase_rad=scene.phase_rad + left @ smooth)
+    contrast = smooth[1:] - smooth[1:].mean(axis=1, keepdims=True)
     means = binned.means.reshape(len(stack.patterns), -1)[:, scene.index].astype(float)
     for own, others in (used, used[::-1]):
         aside, found = stack.weights(others)[0] @ means[others], []
