@@ -1,8 +1,8 @@
 """Drawn benches of the second world: the estimate of the centre against the PID on the laser, in the same weather.
 
 Both are told what a session of `tune` finds: dead time, lag and curve of the pump, noise of the laser, effect of the
-weather. The PID is the best of three, chosen afterwards (SIMC with tc of 1, 2 and 4 effective dead times, 0.5 s at
-least).
+weather. The PID is the best of six, chosen afterwards: SIMC with tc of 1, 2 and 4 effective dead times (0.5 s at
+least), with and without the feed-forward of barometer and thermometer.
 
 python -m benchmarks.centre_benches [--benches 100]
 """
@@ -49,8 +49,8 @@ def pump_of(bench: DrawnBench) -> PumpConfig:
     return PumpConfig.model_validate(told | ({"curve_falling_um_per_s": falling} if bench.play else {}))
 
 
-def loop_of(bench: DrawnBench, times: float) -> LoopConfig:
-    """The loop of a bench, with a closed loop of so many effective dead times."""
+def loop_of(bench: DrawnBench, times: float, weather: bool) -> LoopConfig:
+    """The loop of a bench, with a closed loop of so many effective dead times, with or without weather sensors."""
     theta_s = bench.delay_s + bench.lag_s / 2 + 0.2 + 0.5 / bench.rate_hz  # with the filter
     tc_s = max(0.5, times * theta_s)
     return LoopConfig(
@@ -61,14 +61,15 @@ def loop_of(bench: DrawnBench, times: float) -> LoopConfig:
         barometer_gain_um_per_pa=-0.36,
         temperature_gain_um_per_k=124.0,
         gas_follows_air_s=0.0,
-        feedforward_barometer=bench.barometer,
-        feedforward_temperature=bench.barometer,
+        feedforward_barometer=weather,
+        feedforward_temperature=weather,
     )
 
 
-def held_um(bench: DrawnBench, by: str, duration_s: float, times: float = 1.0, optics: Optics = Optics()) -> float:  # noqa: B008
+def held_um(bench: DrawnBench, by: str, duration_s: float, times: float = 1.0, weather: bool = True) -> float:
     """Standard deviation of the true centre; `by`: "pid", "laser" (the estimate, of it alone) or "all"."""
-    plant, loop, pump = bench.plant(2), loop_of(bench, times), pump_of(bench)
+    plant, pump, optics = bench.plant(2), pump_of(bench), Optics()
+    loop = loop_of(bench, times, weather and bench.barometer)
     told = EstimatorConfig(pump_delay_s=bench.delay_s, pump_lag_s=bench.lag_s, laser_noise_um=bench.laser_um)
     controller, centre = InnerLoop(loop, pump, told), CentreFilter(told, loop)
     dt_s, rng = 1 / bench.rate_hz, np.random.default_rng([bench.seed, 7])
@@ -125,7 +126,8 @@ class Compared:
 def compared(seed: int, duration_s: float) -> Compared:
     """One drawn bench."""
     bench = drawn(seed)
-    pid_um = min(held_um(bench, "pid", duration_s, times) for times in PID_TIMES)
+    weathers = (True, False) if bench.barometer else (False,)
+    pid_um = min(held_um(bench, "pid", duration_s, times, with_) for times in PID_TIMES for with_ in weathers)
     return Compared(bench, pid_um, held_um(bench, "laser", duration_s), held_um(bench, "all", duration_s))
 
 

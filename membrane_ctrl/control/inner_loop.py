@@ -56,7 +56,8 @@ class InnerLoop:
 
     def __init__(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig = EstimatorConfig()) -> None:  # noqa: B008 (frozen)
         self._loop = loop
-        lag_s, own_s, tick_s = estimator.pump_lag_s, 1 / estimator.gain_per_s, 1 / loop.rate_hz
+        lag_s, tick_s = estimator.pump_lag_s, 1 / loop.rate_hz
+        own_s = max(1 / estimator.gain_per_s, lag_s / 3)  # a faster one drives a slow pump from limit to limit
         # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves (docs/estimator.md)
         slow_per_s, fast_per_s = (filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s)))
         self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
@@ -77,8 +78,7 @@ class InnerLoop:
         self.may_probe = True  # not while gains are judged
         self.learned = False  # this tick has ended a segment that told something of the pump
         self._leak = film_health.LeakEstimate()
-        self._setpoint_um = math.nan
-        self._shaped_um = math.nan
+        self._setpoint_um = self._shaped_um = math.nan
 
     @property
     def mean_flow_um_per_s(self) -> float:

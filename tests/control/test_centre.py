@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from benchmarks.centre import Optics, Sensors, hold
-from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, TwinConfig
+from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, Transit
 from membrane_ctrl.control.filters import LearnedFactor, Ramp, ReadingNoise, configured_walk
+from membrane_ctrl.control.inner_loop import InnerLoop
 from tests.support.second_world import ForeignPlant, ForeignPump
 
 LOOP = LoopConfig()
@@ -333,6 +334,12 @@ def test_a_loop_of_few_ticks_a_second_does_not_swing() -> None:
     loop = LoopConfig(rate_hz=4.0)
     held = hold(Sensors(optics=Optics(rate_hz=4.0)), TwinConfig(start_error_um=0.0), 60.0, loop=loop)
     assert held.after(30.0).std() < 0.1
+
+
+def test_a_slow_pump_is_not_driven_from_limit_to_limit() -> None:
+    """A micrometre asks for no more flow of a slow pump than of a quick one."""
+    quick, slow = (InnerLoop(LOOP, PumpConfig(), EstimatorConfig(pump_lag_s=lag_s)) for lag_s in (0.15, 0.6))
+    assert slow._error_gain_per_s < quick._error_gain_per_s < 30.0
 
 
 # Gas in transit.
