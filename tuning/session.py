@@ -315,8 +315,7 @@ def verify_step(
     rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verify.Stage] = []
     record: loop_model.Record | None = None
-    setpoint_um = np.empty(0)
-    reason = ""
+    setpoint_um, reason = np.empty(0), ""
     try:
         rig.hold(verify.settle_s(after))
         for until_s, growth_max in (*stages, (2 * stages[-1][0], stages[-1][1])):

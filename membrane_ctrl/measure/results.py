@@ -21,7 +21,7 @@ from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.uncertainty import monte_carlo
-from membrane_ctrl.metrology.uncertainty.budget import Budget, slope_variance
+from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
@@ -84,7 +84,8 @@ def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline
     except ArithmeticError:
         raise errors.InputError(f"{source}: too wide: the figure does not follow from such a geometry") from None
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
-    variance = slope_variance(optics, full, [checked.stack.shifts_rad(used) for used in checked.view.used], noise_adu)
+    shifts_rad = [checked.stack.shifts_rad(used) for used in checked.view.used]
+    variance = full.slope_variance(optics, shifts_rad, noise_adu)
     cell_slope = math.sqrt(float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0])))
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
     return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope, zonal_um)

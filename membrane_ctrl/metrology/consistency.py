@@ -213,7 +213,7 @@ def examine(
             f"the rim is {outline.offset_mm:.1f} mm off the prediction and {outline.size_ratio:.4f} of its size: "
             "check the camera's pose, the lens and mirror.radius_mm"
         )
-    slope_variance = budget.slope_variance(optics, full, shifts, noise_adu)
+    slope_variance = full.slope_variance(optics, shifts, noise_adu)
     sources = [
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *budget.bench_sources(bench, sigmas),

@@ -49,6 +49,13 @@ class FullResult:
         """The fitted surface."""
         return self.fit.surface
 
+    def slope_variance(self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float) -> FloatArray:
+        """(2,) variance of an x and of a y slope of one pixel, from the noise of a pixel in a frame."""
+        swing = self.quality.modulation_share * (2**optics.camera.bits - 1)
+        sigma_mm = [phase.mm_per_rad(optics.pattern) * phase.phase_sigma_rad(d, noise_adu, swing) for d in shifts_rad]
+        gain = bins.slope_per_screen(Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm)
+        return np.asarray(gain @ np.square(sigma_mm))
+
     def height_mm(self) -> FloatArray:
         """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where not measured."""
         return np.asarray(self.surface.on_grid(self.grid.axis_mm)[0] + self.residual_mm)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology import bins, motion, phase
+from membrane_ctrl.metrology import motion, phase
 from membrane_ctrl.metrology.calibrate import parameters, propagate, residuals
 from membrane_ctrl.metrology.full import FullResult
 from membrane_ctrl.metrology.optics.geometry import Geometry
@@ -297,9 +297,8 @@ def frame_sources(
 ) -> Iterator[Source]:
     """What differs from frame to frame: the light, by `light`, and the film, by `film_um`."""
     effects = frame_effects(bench, optics, shifts_rad)
-    yield Source(
-        "light_relative", "light of each frame", light, light * (effects.level + effects.swing), False, False
-    )
+    told_mm = light * (effects.level + effects.swing)
+    yield Source("light_relative", "light of each frame", light, told_mm, False, False)
     says = "motion of the film from frame to frame that no laser has told"
     yield Source("film_um", says, film_um, film_um * effects.film, False, False)
 
@@ -349,14 +348,3 @@ class Patches:
         _, of_x, of_y = residuals.basis(*self.places_mm / radius_mm)
         x, y = self.count * self.slopes
         return np.asarray(inverse @ ((of_x * x + of_y * y) / radius_mm))
-
-
-def slope_variance(
-    optics: OpticsConfig, full: FullResult, shifts_rad: list[FloatArray], noise_adu: float
-) -> FloatArray:
-    """(2,) variance of an x and of a y slope of one pixel."""
-    swing = full.quality.modulation_share * (2**optics.camera.bits - 1)
-    sigma_mm = [phase.mm_per_rad(optics.pattern) * phase.phase_sigma_rad(d, noise_adu, swing) for d in shifts_rad]
-    geometry = Geometry.from_config(optics)
-    gain = bins.slope_per_screen(geometry, full.surface.radius_mm, full.surface.sag_mm)
-    return np.asarray(gain @ np.square(sigma_mm))
