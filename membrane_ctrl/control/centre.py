@@ -95,6 +95,7 @@ class CentreFilter:
         self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
         self._transit.place(flow_um_per_s)
         self._jumped: list[str] = []
+        self._judged = True
         self.frames = 0  # of the optics since lock
         self._frame_interval_s = FRESH_S[Sensor.OPTICS]
         self._last_frame_s = -math.inf
@@ -119,7 +120,7 @@ class CentreFilter:
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""
-        self._jumped = []
+        self._jumped, self._judged = [], given.judged
         self._predict(given.flow_um_per_s, dt_s)
         self._clone(given.now_s)
         for watch in self._watches:
@@ -290,15 +291,20 @@ class CentreFilter:
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
         if sensor == Sensor.THERMOMETER:
             self._widen(_AIR, innovation, math.inf, 0.0)
-        elif sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
+        elif sensor == Sensor.LASER and self._judged and self._fresh(Sensor.OPTICS, now_s):
             self._widen(_MOUNT, innovation, math.inf, 0.0)
         elif sensor == Sensor.BAROMETER:
             self._widen(_AMBIENT, innovation, since_s, self._pressure_gain)
             self._widen(_GAS, self._pressure_gain * innovation, since_s, 1.0)
         else:
             self._widen(_GAS, innovation, since_s, 1.0)
-            if sensor == Sensor.OPTICS and self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far:
+            if sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
+                self.relock()  # optics that missed it count from where the laser sees the film
+            elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
                 self._widen(_STAND, _OPTICS_JUMP_SHARE * innovation, math.inf, 0.0)
+
+    def _laser_agrees(self, now_s: float) -> bool:
+        return self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far
 
     def _widen(self, state: int, by: float, since_s: float, on_centre: float) -> None:
         """A state, and with it the centre since a time, may have jumped by some `by`."""

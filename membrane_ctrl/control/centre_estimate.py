@@ -35,6 +35,7 @@ class CentreReadings:
     sag_um: float = math.nan
     sag_sigma_um: float = math.nan
     sag_time_s: float = math.nan
+    judged: bool = True  # a third witness will tell whether a jump of the laser was its mount's or the film's
 
 
 @dataclass(frozen=True, slots=True)

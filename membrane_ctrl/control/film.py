@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.filters import LowPass, smoothing
+from membrane_ctrl.control.filters import EarlyMean, LowPass, smoothing
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 # 0.5 Pa of noise per sample are then 0.7 um at 10 Hz and 2.3 um at 1 Hz
 SMOOTH_S = 10.0
-# Before this the first samples' noise still dominates the means.
-WARM_S = 3 * SMOOTH_S
+# A mean of 50 of the gauge's readings is good to 1.4 um; ten-second means of fewer are not much better when warm.
+_KNOWN_S, _KNOWN_READINGS, WARM_S = 5.0, 50, 3 * SMOOTH_S
 # Creep of 10 um/min is 20 um ahead of this reference; the 2 um/min of a mount that warms up are 4 um.
 SINCE_MINUTES_S = 120.0
 # Creep of 17 um/h is 100 um ahead; a fresh film's own (1 % of compliance in a day) is 31 um.
@@ -41,6 +41,11 @@ FLOW_MEAN_S = 15.0
 LEAK_LEAST_UM_PER_S = 0.8
 # If a camera contradicts the laser, gas that agrees with the camera outvotes a gauge that sees nothing.
 CONTRADICTED_MOST = 1.25
+
+
+def _known(seen_s: float, readings: int) -> bool:
+    """Whether the means are good enough for a reference: until there is one, nothing tells what a jump was."""
+    return seen_s >= WARM_S or (seen_s >= _KNOWN_S and readings >= _KNOWN_READINGS)
 
 
 @dataclass(slots=True)
@@ -127,8 +132,8 @@ class FilmMonitor:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._laser, self._trim, self._root = LowPass(SMOOTH_S), LowPass(SMOOTH_S), LowPass(SMOOTH_S)
-        self._seen_s = 0.0
+        self._laser, self._trim, self._root = EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S)
+        self._seen_s, self._readings = 0.0, 0
         self._since = (
             _Since(SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um),
             _Since(SINCE_HOURS_S, self._limits.laser_gauge_drift_max_um),
@@ -146,11 +151,11 @@ class FilmMonitor:
         trim_um = self._trim.update(trim_um, dt_s)  # a knock that the optics have found moves both alike
         # The mean of the root always follows the mean of the sag; the mean of the pressure does not.
         root = self._root.update(math.cbrt(gauge_pressure_pa), dt_s)
-        self._seen_s += dt_s
+        self._seen_s, self._readings = self._seen_s + dt_s, self._readings + 1
         if strange := self._not_nominal(laser_um, root**3):
             return strange
         sag_um = self._sag_um + laser_um
-        if self._seen_s < WARM_S or not (self._taut or root**3 > TAUT_PA):
+        if not _known(self._seen_s, self._readings) or not (self._taut or root**3 > TAUT_PA):
             return ""
         minutes, hours = self._since
         return minutes.apart(laser_um, trim_um, root, sag_um, dt_s) or hours.apart(
@@ -221,9 +226,9 @@ class PlausibilityCheck:
 
     def reset(self) -> None:
         """Forget everything: the mirror is not held."""
-        self._laser, self._gauge, self._optics = LowPass(SMOOTH_S), LowPass(SMOOTH_S), LowPass(SMOOTH_S)
+        self._laser, self._gauge, self._optics = EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S)
         self._reference: tuple[float, float, float] | None = None
-        self._age_s = 0.0
+        self._age_s, self._readings = 0.0, 0
         self._seen_s = math.nan
         self.liar = Liar.NOBODY
         self.changes = Changes(math.nan, math.nan, math.nan)
@@ -232,6 +237,11 @@ class PlausibilityCheck:
     def watching(self) -> bool:
         """Whether it has had readings since the last `reset`."""
         return math.isfinite(self._laser.value)
+
+    @property
+    def judges(self) -> bool:
+        """Whether it would tell a moved laser from a moved film."""
+        return self._reference is not None
 
     def step(
         self, dt_s: float, displacement_um: float, gauge_pressure_pa: float, estimate: ShapeEstimate | None
@@ -242,17 +252,17 @@ class PlausibilityCheck:
         if math.isfinite(gauge_pressure_pa):
             self._gauge.update(gauge_pressure_pa, dt_s)
         if estimate is not None and estimate.verdict != "rejected" and math.isfinite(estimate.sag_um):
-            since_s = SMOOTH_S if math.isnan(self._seen_s) else estimate.time_s - self._seen_s
+            since_s = 0.0 if math.isnan(self._seen_s) else estimate.time_s - self._seen_s
             self._optics.update(estimate.sag_um, max(since_s, 0.0))
             self._seen_s = estimate.time_s
         means = (self._laser.value, self._optics.value, self._gauge.value)
         if all(map(math.isfinite, means)):
-            self._age_s += dt_s
+            self._age_s, self._readings = self._age_s + dt_s, self._readings + 1
             self._judge(means, dt_s)
         return self.liar
 
     def _judge(self, means: tuple[float, float, float], dt_s: float) -> None:
-        if self._age_s < WARM_S:
+        if not _known(self._age_s, self._readings):
             return
         if self._reference is None:
             self._reference = means

@@ -27,6 +27,23 @@ class LowPass:
         return self.value
 
 
+class EarlyMean(LowPass):
+    """A lag that is the plain mean of its inputs until it is old enough: its first input weighs no more than others."""
+
+    def __init__(self, time_constant_s: float) -> None:
+        super().__init__(time_constant_s)
+        self._age_s = 0.0
+
+    def update(self, given: float, dt_s: float) -> float:
+        """Mean after `given` was applied for `dt_s`."""
+        self._age_s += dt_s
+        if math.isnan(self.value):
+            self.value = given
+        elif dt_s > 0:
+            self.value += max(smoothing(dt_s, self.time_constant_s), dt_s / self._age_s) * (given - self.value)
+        return self.value
+
+
 class LagRate:
     """Rate of change of a signal behind a first-order lag, (x - lag(x)) / T, that survives the signal's absence.
 

@@ -101,7 +101,7 @@ class SensorConsistency:
         else:
             self._film.reset()
             self.laser_gauge_apart = ""
-        if state != State.HOLD or abs(held.ramp_left_um) > self._far_um:
+        if state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um:
             return self._rest()
         self._look_at_camera(inputs)
         events = self._judge_weather(inputs, dt_s)
@@ -112,6 +112,8 @@ class SensorConsistency:
             self._plausibility.reset()
             liar = film.Liar.NOBODY
         events += self._judge(liar)
+        if state == State.SETTLE:
+            return events
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
         events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
         return events
@@ -120,6 +122,11 @@ class SensorConsistency:
     def agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
         return self._liar == film.Liar.NOBODY and not self.camera_lies
+
+    @property
+    def judges(self) -> bool:
+        """Laser, camera and gauge are compared: a jump of one of them will be judged."""
+        return self._plausibility.judges
 
     def set_gains(self, loop: LoopConfig, pump: PumpConfig) -> None:
         """Judge by the gains and the curve that are now in force."""
@@ -266,6 +273,7 @@ class Holders:
             sag_um=figure.sag_um - self._stand.um if figure else math.nan,
             sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
             sag_time_s=figure.time_s if figure else math.nan,
+            judged=consistency.judges,
         )
         self.estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = self.estimate.mount_um

@@ -300,8 +300,6 @@ def test_devices_without_a_laser_are_accepted_only_for_such_a_bench() -> None:
 
 
 def _judge_knock(um: float, until_s: float) -> None:
-    """The first comparison of laser, camera and gauge is at 37 s."""
-
     def knock(wrong: Wrong, now_s: float) -> None:
         wrong.laser_offset_um = um if now_s > 38.0 else 0.0
 
@@ -332,15 +330,15 @@ def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
 
 # A film that jumps.
 
-JUMP_S = 40.0  # laser, camera and gauge are compared from 37 s on
+JUMP_S = 40.0
 
 
-def _blind(um: float) -> Callable[[Wrong, float], None]:
+def _blind(um: float, jump_s: float = JUMP_S) -> Callable[[Wrong, float], None]:
     """A camera that has not seen that the film moved; nor is there a barometer."""
 
     def fail(wrong: Wrong, now_s: float) -> None:
-        wrong.barometer_lost = now_s > JUMP_S - 0.1
-        wrong.camera_offset_um = -um if now_s > JUMP_S else 0.0
+        wrong.barometer_lost = now_s > jump_s - 0.1
+        wrong.camera_offset_um = -um if now_s > jump_s else 0.0
 
     return fail
 
@@ -366,6 +364,61 @@ def _judge_jump(um: float, seen: bool) -> None:
 def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) -> None:
     """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is undone."""
     _judge_jump(-25.0, seen)
+
+
+AT_10_HZ = {"loop": LoopConfig(rate_hz=10.0)}
+
+
+def _early(config: Config, jump_s: float, um: float, fail: Callable[[Wrong, float], None]) -> tuple[str, float]:
+    """A jump soon after the start, which settles from 8.5 s on: the safe state or the verdict, and how far off."""
+    ticks = held(
+        jump_s + 60.0, fail, config.model_copy(update=AT_10_HZ), AmbientChange(jump_s, um / -0.358, 0.1), None, 0.2
+    )
+    faults = [fault.name for fault in told(ticks, Fault) if fault.name != "displacement_missing"]
+    liars = [event.liar for event in told(ticks, Plausibility)]
+    off_um = true_um(ticks, ticks[-1].row.mono_s - 3.0).mean() - true_um(ticks, jump_s - 1.0, jump_s).mean()
+    return (faults or liars or [""])[-1], off_um
+
+
+@pytest.mark.parametrize("jump_s", [12.0, 20.0, 30.0])
+@pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
+def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(config: Config, jump_s: float) -> None:
+    """The gauge is asked from the fifth second of settling on; before that the laser is believed."""
+    verdict, off_um = _early(config, jump_s, -40.0, _blind(-40.0, jump_s))
+    assert (verdict, off_um) == ("optics", pytest.approx(0.0, abs=2.0))
+
+
+def test_a_jump_at_the_start_that_optics_alone_miss_ends_in_the_safe_state() -> None:
+    assert _early(BY_OPTICS, 20.0, -40.0, _blind(-40.0, 20.0))[0] == "laser_gauge_apart"
+
+
+@pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
+def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(config: Config) -> None:
+    def fail(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = 15.0 < now_s < 25.0
+        wrong.laser_offset_um = 60.0 if now_s > 20.0 else 0.0
+
+    assert _early(config, 20.0, 0.0, fail)[0] == "laser_gauge_apart"
+
+
+def test_knock_and_jump_at_once_are_told_apart() -> None:
+    def fail(wrong: Wrong, now_s: float) -> None:
+        wrong.laser_offset_um = 60.0 if now_s > 20.0 else 0.0
+
+    assert _early(BY_ALL, 20.0, -40.0, fail) == ("nobody", pytest.approx(0.0, abs=0.3))
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("config", [BY_ALL, BY_LASER, BY_OPTICS], ids=["all", "laser", "optics"])
+@pytest.mark.parametrize("seed", range(15))
+def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) -> None:
+    """Below 10 um the optics prevail in the trim; 20 um and a third are what optics alone and gauge may be apart."""
+    rng = np.random.default_rng(seed)
+    least_um = 32.0 if config is BY_OPTICS else 22.0
+    um = float(np.exp(rng.uniform(math.log(least_um), math.log(60.0))) * rng.choice([-1.0, 1.0]))
+    jump_s = float(rng.uniform(14.0 if config is BY_OPTICS else 10.0, 60.0))
+    verdict, off_um = _early(config, jump_s, um, _blind(um, jump_s))
+    assert verdict == "laser_gauge_apart" or abs(off_um) < 3.5
 
 
 @pytest.mark.campaign
