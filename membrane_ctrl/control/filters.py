@@ -28,7 +28,7 @@ class LowPass:
 
 
 class EarlyMean(LowPass):
-    """A lag that is the plain mean of its inputs until it is old enough: its first input weighs no more than others."""
+    """A lag that is the plain mean of its inputs at first: none weighs more than the others."""
 
     def __init__(self, time_constant_s: float) -> None:
         super().__init__(time_constant_s)
