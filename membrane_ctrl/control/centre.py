@@ -90,7 +90,7 @@ class CentreFilter:
         self._origin = [math.nan, math.nan, math.nan]  # first pressure, air temperature, sag
         self._watches = [_Watch() for _ in Sensor]
         self._noises = [ReadingNoise(stated=sensor == Sensor.OPTICS) for sensor in Sensor]
-        self._walks = [configured_walk() for _ in range(3)]  # of the centre, of the pressure, of the air
+        self._walks = [configured_walk() for _ in range(4)]  # of centre, pressure, air, and the laser's mount
         self._ramps = [Ramp(limit) for limit in _RUN]
         self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
         self._transit.place(flow_um_per_s)
@@ -121,7 +121,7 @@ class CentreFilter:
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""
         self._jumped, self._judged = [], given.judged
-        self._predict(given.flow_um_per_s, dt_s)
+        self._predict(given, dt_s)
         self._clone(given.now_s)
         for watch in self._watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
@@ -148,10 +148,10 @@ class CentreFilter:
             self._origin[which] = value
         return value - self._origin[which]
 
-    def _predict(self, flow_um_per_s: float, dt_s: float) -> None:
+    def _predict(self, given: CentreReadings, dt_s: float) -> None:
         x, p, config = self._x, self._p, self._config
         follow = smoothing(dt_s, self._gas_follows_air_s)
-        x[_GAS] += self._transit.advance(flow_um_per_s, dt_s) - x[_LEAK] * dt_s
+        x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
         for matrix in (p, p.T):
             matrix[_GAS] -= dt_s * matrix[_LEAK]
@@ -160,7 +160,9 @@ class CentreFilter:
         p[_LEAK, _LEAK] += dt_s * config.leak_walk_um_per_s_per_root_s**2
         p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
         p[_AIR, _AIR] += dt_s * self._air_walk()
-        p[_MOUNT, _MOUNT] += dt_s * config.mount_walk_um_per_root_s**2
+        # without optics no reading tells mount from film, and what was learned of a drift would let the film drift
+        drifts = self._walks[3].factor if self._fresh(Sensor.OPTICS, given.now_s) else 1.0
+        p[_MOUNT, _MOUNT] += dt_s * drifts * config.mount_walk_um_per_root_s**2
 
     def _clone(self, now_s: float) -> None:
         """Remember the centre of this tick in the oldest clone."""
@@ -254,6 +256,8 @@ class CentreFilter:
             by_air = self._air_walk() * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
             own = (centre := self._centre_walk()) / (centre + by_air)
             walks = ((self._walks[0], own), (self._walks[2], 1 - own))
+        else:  # a laser beside the optics shows its mount: drift that is not its walk would count as its noise
+            walks = ((self._walks[3], 1.0),)
         self._noises[sensor].learn(self._watches[sensor].innovation, share, dt_s, walks)
 
     def _pressure_walk(self) -> float:
@@ -296,6 +300,9 @@ class CentreFilter:
         elif sensor == Sensor.BAROMETER:
             self._widen(_AMBIENT, innovation, since_s, self._pressure_gain)
             self._widen(_GAS, self._pressure_gain * innovation, since_s, 1.0)
+        elif sensor == Sensor.OPTICS and self._laser_agrees(now_s) and not self._fresh(sensor, since_s):
+            # they are back, and the mirror has followed the laser's mount meanwhile
+            self._widen(_GAS, innovation, -math.inf, 1.0, on_mount=-1.0)
         else:
             self._widen(_GAS, innovation, since_s, 1.0)
             if sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
@@ -306,9 +313,10 @@ class CentreFilter:
     def _laser_agrees(self, now_s: float) -> bool:
         return self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far
 
-    def _widen(self, state: int, by: float, since_s: float, on_centre: float) -> None:
-        """A state, and with it the centre since a time, may have jumped by some `by`."""
+    def _widen(self, state: int, by: float, since_s: float, on_centre: float, on_mount: float = 0.0) -> None:
+        """A state, and with it the centre since a time and the laser's mount, may have jumped by some `by`."""
         jump = np.zeros_like(self._x)
+        jump[_MOUNT] = on_mount * by
         jump[state] = by
         jump[_PLANT:][self._times >= since_s] = on_centre * by
         self._p += jump[:, None] * jump

@@ -282,10 +282,25 @@ def test_a_jump_of_the_optics_is_undone_by_the_laser() -> None:
 
 
 def test_a_drifting_mount_does_not_move_the_centre() -> None:
+    """It is followed, and neither taken for noise nor left behind: the laser may soon have to hold alone."""
     drifting = lambda now_s, given: _changed(given, laser_um=now_s * 2.0 / 60)  # noqa: E731
-    estimates = _still(60.0, drifting)
+    filtered = CentreFilter(CONFIG, LOOP)
+    filtered.start(0.0, FLOW, 0.0)
+    estimates = _still(120.0, drifting, filtered)
     assert np.abs(_centres(estimates, 5.0)).max() < 0.12
-    assert estimates[-1].mount_um == pytest.approx(2.0, abs=1.6)
+    assert estimates[-1].mount_um - estimates[round(5.0 / DT_S)].mount_um == pytest.approx(115 * 2 / 60, abs=0.6)
+    assert filtered._noises[LASER].factor == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("um", [1.5, 8.0])
+def test_optics_that_are_back_undo_what_the_laser_s_mount_did_meanwhile(um: float) -> None:
+    def alter(now_s: float, given: CentreReadings) -> CentreReadings:
+        given = _changed(given, laser_um=um * min(max(now_s - 6, 0.0) / 10, 1.0))
+        return _changed(given, sag_um=math.nan) if 6 < now_s < 17 else given
+
+    centres_um = _centres(_still(20.0, alter), 6.0)
+    assert centres_um[round(10.5 / DT_S)] == pytest.approx(um, abs=0.5)  # only the laser sees it
+    assert np.abs(centres_um[round(12.0 / DT_S) :]).max() < 0.15
 
 
 def test_each_sensor_alone_and_none() -> None:

@@ -29,7 +29,7 @@ from membrane_ctrl.model.events import (
 )
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import AirTemperatureChange, AmbientChange, BenchEvent
+from membrane_ctrl.sim.surroundings import AirTemperatureChange, AmbientChange, BenchEvent, LaserDrift
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 TWIN = TwinConfig(laser=False, start_error_um=-5.0, scenario="quiet")
@@ -39,6 +39,7 @@ BY_ALL = Config(
 )
 BY_TRACKS = BY_ALL.model_copy(update={"shape": ShapeConfig(mode="track")})
 BY_LASER = Config(twin=BY_ALL.twin)
+AT_10_HZ = {"loop": LoopConfig(rate_hz=10.0)}
 NOTHING: Callable[[Wrong, float], None] = lambda wrong, now_s: None  # noqa: E731
 
 
@@ -328,6 +329,23 @@ def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
     _judge_knock(float(np.exp(rng.uniform(math.log(14.0), math.log(400.0))) * rng.choice([-1.0, 1.0])), 120.0)
 
 
+@pytest.mark.parametrize("shape_off", [False, pytest.param(True, marks=pytest.mark.campaign)])
+def test_a_laser_whose_mount_drifts_takes_over_where_the_mirror_is(shape_off: bool) -> None:
+    """The camera goes after four minutes of drift by 2 um/min: half a minute later the mirror is 1 um off, not 7."""
+
+    def lose(wrong: Wrong, now_s: float) -> None:
+        wrong.camera_lost = 300.0 < now_s < 330.0 and not shape_off
+
+    switches = {3000: Command("shape_off", "a test"), 3300: Command("shape_on", "a test")} if shape_off else {}
+    config = BY_ALL.model_copy(update=AT_10_HZ)
+    ticks = held(360.0, lose, config, LaserDrift(60.0, 2.0, 600.0), switches, 0.2)
+    assert not told(ticks, Fault)
+    before_um = true_um(ticks, 280.0, 300.0).mean()
+    assert np.abs(true_um(ticks, 300.0, 330.0) - before_um).max() < 1.5
+    after_um = true_um(ticks, 345.0).mean()  # a switch takes the figure of its time as the new one
+    assert after_um == pytest.approx(true_um(ticks, 325.0, 330.0).mean() if shape_off else before_um, abs=0.2)
+
+
 # A film that jumps.
 
 JUMP_S = 40.0
@@ -364,9 +382,6 @@ def _judge_jump(um: float, seen: bool) -> None:
 def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) -> None:
     """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is undone."""
     _judge_jump(-25.0, seen)
-
-
-AT_10_HZ = {"loop": LoopConfig(rate_hz=10.0)}
 
 
 def _early(config: Config, jump_s: float, um: float, fail: Callable[[Wrong, float], None]) -> tuple[str, float]:
