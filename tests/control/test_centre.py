@@ -298,7 +298,9 @@ def test_optics_that_are_back_undo_what_the_laser_s_mount_did_meanwhile(um: floa
         given = _changed(given, laser_um=um * min(max(now_s - 6, 0.0) / 10, 1.0))
         return _changed(given, sag_um=math.nan) if 6 < now_s < 17 else given
 
-    centres_um = _centres(_still(20.0, alter), 6.0)
+    estimates = _still(20.0, alter)
+    assert [jump.split()[0] for estimate in estimates for jump in estimate.jumped] == ["optics"]
+    centres_um = _centres(estimates, 6.0)
     assert centres_um[round(10.5 / DT_S)] == pytest.approx(um, abs=0.5)  # only the laser sees it
     assert np.abs(centres_um[round(12.0 / DT_S) :]).max() < 0.15
 

@@ -403,6 +403,10 @@ def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(config: Conf
     assert (verdict, off_um) == ("optics", pytest.approx(0.0, abs=2.0))
 
 
+def test_before_the_gauge_can_judge_a_jump_the_laser_is_believed() -> None:
+    assert abs(_early(BY_ALL, 10.3, -25.0, _blind(-25.0, 10.3))[1]) < 2.0
+
+
 def test_a_jump_at_the_start_that_optics_alone_miss_ends_in_the_safe_state() -> None:
     assert _early(BY_OPTICS, 20.0, -40.0, _blind(-40.0, 20.0))[0] == "laser_gauge_apart"
 
