@@ -166,7 +166,6 @@ def held_um(seconds: float) -> NDArray[np.float64]:
     return moved_um[round(240.0 * config.loop.rate_hz) :] - moved_um[-1]
 
 
-@pytest.mark.xfail(reason="27 Hz leaves ghosts at 8.65 and 9.91 Hz, its aliases at one rate each", strict=True)
 @pytest.mark.campaign
 def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     """Two minutes of the twin's film, as a hold moves it, vibrating by 20 nm at each of a drum's frequencies."""

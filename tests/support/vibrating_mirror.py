@@ -71,6 +71,7 @@ def watched(
     quality: float = math.inf,
     amplitude_nm: float = 5.0,
     drums: bool = False,
+    drift_nm: float = 1.0,
 ) -> tuple[FloatArray, FloatArray, list[Planted]]:
     """Times, terms in um and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
 
@@ -79,7 +80,8 @@ def watched(
     rng = np.random.default_rng(seed)
     t = frame_times_s(rates_hz, seconds)
     mixed = np.linalg.qr(rng.normal(size=(36, 36)))[0]
-    terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed + np.cumsum(rng.normal(size=(t.size, 36)), axis=0)
+    terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed
+    terms_nm += drift_nm * np.cumsum(rng.normal(size=(t.size, 36)), axis=0)
     planted = []
     for line_hz in lines_hz:
         frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), at_rest(rng.normal(size=36))

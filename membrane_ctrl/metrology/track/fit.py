@@ -36,8 +36,6 @@ _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 _TUKEY_SIGMAS = 7.0
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
-
-
 _STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
 _FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not

@@ -30,6 +30,7 @@ _LEAST_HZ = 1.2  # slower than that is weather, leak and control
 _GRID = 4  # frequencies per resolution
 _TAKEN = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # resolutions about a line that go with it: it may be damped
 _SHORTEST = 0.6  # shorter frames of one rate, in pieces, are left out
+_GRAIN_UM = 1e-3  # of a hold's terms: they have at least the noise of rounding
 _GAP = 4.5  # intervals: as long a pause ends a piece
 _MOST = 24
 _CHANCE = 1e-9  # of a false line in one search
@@ -167,19 +168,17 @@ def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
     """Terms less a cubic, clipped at six robust deviations."""
     base = np.column_stack([np.linspace(-1, 1, time_s.size) ** power for power in range(4)])
     left = terms_um - base @ np.linalg.lstsq(base, terms_um, rcond=None)[0]
-    spread = 1.4826 * np.median(np.abs(left), axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(left), axis=0), _GRAIN_UM)
     return np.asarray(np.clip(left, -6 * spread, 6 * spread))
 
 
 def _evidence(spectra: list[ComplexArray], pieces: list[_Piece]) -> FloatArray:
     """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of their noise."""
-    white = np.stack(
-        [
-            spectrum / np.sqrt(_noise(np.abs(spectrum) ** 2, piece.alias_hz))
-            for spectrum, piece in zip(spectra, pieces, strict=True)
-        ],
-        axis=1,
-    )
+    each = []
+    for spectrum, piece in zip(spectra, pieces, strict=True):
+        rounding = np.sum(piece.window**2) * _GRAIN_UM**2 / 12
+        each.append(spectrum / np.sqrt(np.maximum(_noise(np.abs(spectrum) ** 2, piece.alias_hz), rounding)))
+    white = np.stack(each, axis=1)
     power = np.sum(np.abs(white) ** 2, axis=2)
     quiet = white[power <= np.median(power, axis=0)]  # lines, and their aliases, are in the other half
     values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
