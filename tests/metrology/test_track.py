@@ -14,7 +14,7 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracked import TrackedFrame
+from membrane_ctrl.metrology.track.tracked import Jumps, TrackedFrame
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
@@ -107,6 +107,22 @@ def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
     frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))]
     assert [frame.verdict for frame in frames] == ["ok", "ok"]
     assert frames[1].sag_um - frames[0].sag_um == pytest.approx(5.0, abs=0.15)
+
+
+def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
+    """The first parameter moves, the second jumps at steps, the others are noise."""
+    random, jumps, expected = np.random.default_rng(1), Jumps(), []
+    for k in range(60):
+        step, now = divmod(k, 10)[0], np.zeros(36)
+        now[:2] = 0.3 * math.sin(0.2 * k), 0.05 * (-1) ** step
+        expected.append(jumps.add((float(step), 0.0), now + random.normal(0, 0.001, 36)))
+    assert np.flatnonzero(expected).tolist() == [10, 20, 30, 40, 50]
+    sigma = np.sqrt(jumps.variance_mm2())
+    assert sigma[1] == pytest.approx(0.1, rel=0.05)
+    assert sigma[0] < 0.01
+    assert np.median(sigma) < 0.002
+    jumps.begin()  # what was before is no jump
+    assert not jumps.add((9.0, 0.0), np.ones(36))
 
 
 def hand(frame: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:

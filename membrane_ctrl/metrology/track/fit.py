@@ -39,6 +39,7 @@ _BLOCKS = 20  # squares along the mirror's diameter whose errors count as indepe
 _STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
 _FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not
+_FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now this, now that has changed: dust moved
 
 
 @kernel
@@ -234,12 +235,16 @@ class FrameFitter:
         gain = self._inverse[:PARAMETERS]
         pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface, fit.light)
         pull *= fit.weights * fit.residual_adu
-        blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
-        sums = np.stack([np.bincount(blocks, row) for row in pull])
+        sums = self.in_squares(pull)
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
+
+    def in_squares(self, pull: Singles) -> FloatArray:
+        """Sums (rows, squares) of (rows, n) over squares of the mirror whose errors count as independent."""
+        blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
+        return np.stack([np.bincount(blocks, row) for row in pull])
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
@@ -288,8 +293,8 @@ def steadied(places_mm: FloatArray, variance_mm2: FloatArray) -> tuple[FloatArra
 
 def stepped(
     fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
-) -> tuple[CrossedScene, FloatArray]:
-    """The scene as the steps saw it, and by how much that moves the surface's parameters (36,).
+) -> tuple[CrossedScene, FloatArray, FloatArray]:
+    """The scene as the steps saw it; by how much that moves the surface's parameters (36,), and their variance.
 
     `fits` are those of the N single frames, `seen_adu` (N, n) their bins, `shifts_rad` (N, 2) their steps.
     """
@@ -305,20 +310,21 @@ def stepped(
     solved = np.linalg.solve(turned @ design, turned @ rest[..., None])[..., 0]
     swing = np.hypot(solved[:, 1::2], solved[:, 2::2]).T
     off_rad = np.arctan2(solved[:, 2::2], solved[:, 1::2]).T
-    good = (np.abs(off_rad) < _FAR_RAD).all(axis=0) & (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
-    moved, left_rad = _split(fitter, off_rad, swing * good)
+    weights = np.stack([fit.weights for fit in fits])
+    good = ((weights > _FITS).all(axis=0) | (weights < _FAILS).all(axis=0)) & (np.abs(off_rad) < _FAR_RAD).all(axis=0)
+    good &= (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
+    moved, variance, left_rad = _split(fitter, off_rad, swing * good)
     light = np.stack([solved[:, 0], *swing])
     light = np.where(good, light, scene.light_adu)
-    return scene.with_light(light, scene.beyond_mm + good * left_rad / scene.rad_per_mm), moved
+    return scene.with_light(light, scene.beyond_mm + good * left_rad / scene.rad_per_mm), moved, variance
 
 
-def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Phases (2, n) as a change of the surface's parameters (36,), and what is left of them."""
-    jacobian = fitter.jacobian
-    matrix, right = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    for axis in range(2):
-        weighted = jacobian[axis] * weight[axis].astype(np.float32) ** 2
-        matrix += weighted @ jacobian[axis].T
-        right += weighted @ off_rad[axis]
-    moved = np.asarray(np.linalg.solve(matrix, right), float)
-    return moved, off_rad - moved @ jacobian
+def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
+    weighted = fitter.jacobian * weight[:, None].astype(np.float32) ** 2
+    matrix: FloatArray = np.sum(weighted @ fitter.jacobian.transpose(0, 2, 1), axis=0, dtype=float)
+    moved = np.asarray(np.linalg.solve(matrix, np.einsum("apn,an->p", weighted, off_rad)), float)
+    left_rad = off_rad - moved @ fitter.jacobian
+    pull = np.sum(weighted * left_rad[:, None].astype(np.float32), axis=0)  # light that changed between the steps
+    errors = np.linalg.solve(matrix, fitter.in_squares(pull))
+    return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

@@ -1,12 +1,13 @@
 """A tracked frame: its figure, faults that its light shows, whether its change can be a film's, the mean of many."""
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
-from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, squares
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, squares
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Singles
@@ -75,12 +76,13 @@ class StandingFrames:
             self.count = 0
         if not self.count:
             self._seen, self._light = np.zeros(seen_adu.size), np.zeros_like(fit.light)
-            self._left = np.zeros(seen_adu.size)
+            self._left, self._weights = np.zeros(seen_adu.size), np.zeros(seen_adu.size)
             self._parameters = [parameters]
         self.count += 1
         self._seen += seen_adu
         self._light += fit.light
         self._left += fit.weights * fit.residual_adu
+        self._weights += fit.weights
         self._parameters.append(parameters)
 
     def seen_adu(self) -> Singles:
@@ -90,8 +92,41 @@ class StandingFrames:
     def fit(self, radius_mm: float) -> FrameFit:
         """The mean solution."""
         shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
-        left = (self._left / self.count).astype(np.float32)
-        return FrameFit(shape, self._light / self.count, left, np.ones_like(left), True)
+        left, weights = ((sums / self.count).astype(np.float32) for sums in (self._left, self._weights))
+        return FrameFit(shape, self._light / self.count, left / np.maximum(weights, 1e-6), weights, True)
+
+
+class Jumps:
+    """By how much the figure jumps at steps of the pattern, beyond what it does from frame to frame.
+
+    A panel on which pictures stick shows the former step beside the present one, which looks like a tilt.
+    """
+
+    def __init__(self) -> None:
+        self._still: deque[FloatArray] = deque(maxlen=50)
+        self._steps: deque[FloatArray] = deque(maxlen=ENOUGH_STEPS)
+        self.begin()
+
+    def begin(self) -> None:
+        """What comes next is not compared with what was before."""
+        self._path: deque[tuple[tuple[float, float], FloatArray]] = deque(maxlen=3)
+
+    def add(self, shifts_rad: tuple[float, float], parameters: FloatArray) -> bool:
+        """Take the next frame; True if it showed a jump's size."""
+        self._path.append((shifts_rad, parameters))
+        if len(self._path) < 3 or self._path[0][0] != self._path[1][0]:
+            return False
+        before, last, now = (place for _, place in self._path)
+        stepped = shifts_rad != self._path[1][0]
+        (self._steps if stepped else self._still).append((now - 2 * last + before) ** 2)
+        return stepped
+
+    def variance_mm2(self) -> FloatArray:
+        """Of the parameters (36,); zeros where frames of one step scatter nearly as much."""
+        if not self._steps or not self._still:
+            return np.zeros(surface.PARAMETERS)
+        steps_mm2, still_mm2 = (np.mean(squared, axis=0) for squared in (self._steps, self._still))
+        return np.asarray(np.maximum(steps_mm2 - 2 * still_mm2, 0.0))
 
 
 @dataclass(frozen=True)

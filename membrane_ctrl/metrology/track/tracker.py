@@ -31,7 +31,7 @@ _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
-_SIGMA_EVERY = 25  # frames: errors change slowly, and the covariance costs as much as five fits
+_SIGMA_EVERY_S = 1.25  # errors change slowly, and the covariance costs as much as five fits
 
 
 class Tracker:
@@ -63,13 +63,14 @@ class Tracker:
         self._blind = noise_adu < _BLIND_NOISE_ADU
         self._noise_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
         self._fitter = FrameFitter(scene)
+        self._jumps = tracked.Jumps()
         self._begin(scene, scene.surface)
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
         self._anchor_light = math.nan
         self._orders = tracked.LostOrders(self._fitter)
         self._knocked = ""
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
-        self._covariance_um2, self._covariance_age = np.full((36, 36), math.nan), 0
+        self._covariance_um2, self._covariance_s = np.full((36, 36), math.nan), -math.inf
         self._sag_sigma_um = math.nan
         self._left, self._count = np.zeros(scene.index.size), 0
 
@@ -81,6 +82,7 @@ class Tracker:
         self._scale_adu, self._light = 0.0, math.nan
         self._seen: Singles = none
         self._squares = tracked.Squares(scene)
+        self._jumps.begin()
         self._steps: list[tracked.StandingFrames] = []
 
     def anchor(
@@ -128,9 +130,9 @@ class Tracker:
         old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
         seen_at, place_mm2 = steadied(np.array([fit.surface.parameters for fit in fits]), np.array(variance_mm2))
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
-        self._places_mm2 = dict(zip(shifts_rad, place_mm2, strict=True))
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
-        scene, moved = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
+        scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
+        self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
         self._anchor_light /= float(np.median(scene.light_adu[0] / old.light_adu[0]))  # light counts from the scene's
         parameters = self._last.surface.parameters + moved
         self._begin(scene, surface.Surface.from_parameters(parameters, scene.surface.radius_mm))
@@ -313,9 +315,9 @@ class Tracker:
     def _result(
         self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: Finding, rest: float
     ) -> TrackedFrame:
-        if self._covariance_age % _SIGMA_EVERY == 0:
+        if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
+            self._covariance_s = time_s
             self._estimate_errors(fit, shifts_rad)
-        self._covariance_age += 1
         return TrackedFrame(
             time_s=time_s,
             coeffs_um=1e3 * fit.surface.coeffs_mm,
@@ -333,7 +335,8 @@ class Tracker:
 
     def _estimate_errors(self, fit: FrameFit, shifts_rad: tuple[float, float]) -> None:
         """Covariance of the coefficients and sigma of the sag, smoothed over the estimates."""
-        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu) + np.diag(self._place_mm2(shifts_rad))
+        common_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2()
+        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu) + np.diag(common_mm2)
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         covariance = 1e6 * to_coeffs @ found @ to_coeffs.T
         sag_sigma_um = 1e3 * math.sqrt(gradient @ found @ gradient)
