@@ -93,7 +93,8 @@ class StandingFrames:
         """The mean solution."""
         shape = surface.Surface.from_parameters(np.mean(self._parameters[1:], axis=0), radius_mm)
         left, weights = ((sums / self.count).astype(np.float32) for sums in (self._left, self._weights))
-        return FrameFit(shape, self._light / self.count, left / np.maximum(weights, 1e-6), weights, True)
+        left /= np.maximum(weights, np.float32(1e-6))
+        return FrameFit(shape, self._light / self.count, left, weights, True)
 
 
 class Jumps:
