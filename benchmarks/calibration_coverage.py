@@ -101,7 +101,7 @@ class DrawnBench:
         """The frames of a film set, and the film's true mean displacement."""
         light = Light(gamma=self.room.gamma)
         renderer = BentRays(self.there, self.film, light, seed=seed, **self.bends)
-        stack = self.room.stack(partial(self.render, renderer, moved_um), np.random.default_rng(seed), BITS)
+        stack = self.room.stack(partial(self.render, renderer, moved_um), np.random.default_rng(seed), CAMERA)
         readings_um = (moved_um + stack.displacement_um) / (1 + self.off["laser_relative"])
         return FrameStack(stack.frames, stack.patterns, readings_um, {}), moved_um + self.room.mean_um
 
@@ -120,7 +120,7 @@ class DrawnBench:
             seed=seed, **self.bends,
         )  # fmt: skip
         room = replace(self.room, moves_um=0.0, laser=False)
-        stack = room.stack(partial(self.render, renderer, 0.0), rng, BITS)
+        stack = room.stack(partial(self.render, renderer, 0.0), rng, CAMERA)
         stated = self.stated.model_copy(update={"mirror": mirror})
         return replace(phases_of("sphere", check(stack, stated), stated), artefact=SPHERE)
 

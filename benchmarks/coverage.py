@@ -143,7 +143,9 @@ def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> tuple[OpticsCo
     lens = {"focal_mm": geometry.focal_px * stated.camera.pixel_um * 1e-3, "principal_px": geometry.principal_px}
     optics = OpticsConfig(
         geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
-        camera=stated.camera.model_copy(update={**lens, "distortion": geometry.distortion}),
+        camera=stated.camera.model_copy(
+            update={**lens, "distortion": geometry.distortion, "bits": 16, "noise_adu": 0.0}  # see `Room.stack`
+        ),
         pattern=stated.pattern.model_copy(update={"period_mm": stated.pattern.period_mm * there.pitch}),
     )
     return optics, off
@@ -185,9 +187,12 @@ class Room:
         return [name for name, there in named.items() if there]
 
     def stack(
-        self, render: Callable[[Any, float, float], FloatArray], rng: np.random.Generator, bits: int = 8
+        self, render: Callable[[Any, float, float], FloatArray], rng: np.random.Generator, camera: CameraConfig
     ) -> FrameStack:
-        """A set whose film moves by a random walk about its mean."""
+        """A set whose film moves by a random walk about its mean. `render` gives 16 bits without noise.
+
+        The camera's noise, and its one rounding, come after the blur.
+        """
         shown = pattern_sequence("full", OpticsConfig().pattern)
         where_um = self.moves_um * np.cumsum(rng.standard_normal(len(shown))) / math.sqrt(len(shown))
         where_um += rng.uniform(-20.0, 20.0) * (self.moves_um > 0)
@@ -198,7 +203,9 @@ class Room:
             frame = frame + self.ambient * white / 2 * k / len(shown)
             if self.blur_px:
                 frame = cv2.GaussianBlur(frame, (0, 0), self.blur_px / SHRINK)
-            frames.append(np.clip(np.rint(frame), 0, 2**bits - 1).astype(np.uint8 if bits == 8 else np.uint16))
+            full = 2**camera.bits - 1
+            frame = frame * (full / (2**16 - 1)) + camera.noise_adu * rng.standard_normal(frame.shape)
+            frames.append(np.clip(np.rint(frame), 0, full).astype(np.uint8 if camera.bits == 8 else np.uint16))
         if self.dust:
             for row, column in rng.integers(20, 230, (20, 2)):
                 for frame in frames[:: rng.integers(1, 3)]:
@@ -281,7 +288,7 @@ def bench(seed: int) -> dict[str, Any]:
     spread, _ = spread_of(stated, None)
     live, seen_live = LiveReconstructor(stated, LIVE_BIN_PX, laser_noise_um=LASER_NOISE_UM, spread=spread), []
     for _ in range(2):
-        stack = room.stack(render, rng)
+        stack = room.stack(render, rng, stated.camera)
         truth = truth_of(film, room.mean_um, points_mm)
         seen_live.append(live_answer(live, stack, truth) if room.laser else None)  # a hold has one
         try:

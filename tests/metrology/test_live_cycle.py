@@ -14,9 +14,12 @@ from metrology_truth import SMALL
 
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
+from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
+from membrane_ctrl.metrology.calibrate.solve import general_form
 from membrane_ctrl.metrology.live import LiveReconstructor
+from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
-from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, changed
+from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
@@ -382,6 +385,36 @@ def test_a_noisy_laser_is_in_the_bar() -> None:
     worst = int(np.argmax(bar_um))
     assert coeffs.std(axis=0)[worst] == pytest.approx(bar_um[worst], rel=0.35)
     assert bar_um[worst] > 5 * np.median(bar_um)
+
+
+def test_the_harmonics_of_the_display_move_with_the_film() -> None:
+    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 um of sag, five times the noise."""
+    light = Light(gamma=2.0)
+    live, where = _live(light=light, bin_px=2), _moving(25.0)
+    still = live.fringes(*_render("fringes", float(where.mean()), light=light))
+    moved = live.fringes(*_render("fringes", where, light=light))
+    bar_um = np.sqrt(np.diag(still.covariance_um2 + moved.covariance_um2))[3:]
+    assert abs(moved.sag_um - still.sag_um) < 0.05
+    assert np.abs((moved.coeffs_um - still.coeffs_um)[3:] / bar_um).max() < 4
+    pure = _live(bin_px=2)
+    assert moved.sag_sigma_um < 1.5 * pure.fringes(*_render("fringes", where)).sag_sigma_um
+
+
+def test_what_a_wrong_geometry_makes_of_a_told_motion_is_in_the_bar() -> None:
+    """A film that is deeper in all x frames than in all y frames, as the laser says; benches that are a sigma off."""
+    names, sigma_deg = ("camera_roll_deg", "screen_turn_z_deg"), 0.3
+    spread, ratios = GeometrySpread(names, np.diag([sigma_deg**2] * 2)), []
+    where = np.repeat([30.0, -30.0], 4)
+    for name in names:
+        values = np.zeros(len(NAMES))
+        values[NAMES.index(name)] = sigma_deg
+        geometry = general_form(bench_at(Geometry.from_config(OPTICS), values).geometry, OPTICS)
+        live = LiveReconstructor(OPTICS.model_copy(update={"geometry": geometry}), 2, spread=spread)
+        live.full(*_render("full"))
+        still, moved = live.fringes(*_render("fringes")), live.fringes(*_render("fringes", where))
+        bar_um = np.sqrt(np.diag(still.covariance_um2 + moved.covariance_um2))[3:]
+        ratios.append(np.abs(moved.coeffs_um - still.coeffs_um)[3:] / bar_um)
+    assert np.max(ratios) < 4
 
 
 def test_the_bar_grows_with_the_displacement_until_a_new_reference() -> None:

@@ -251,6 +251,7 @@ class FrameEffects:
     level: FloatArray  # its light, relative
     swing: FloatArray  # the amplitude of its fringes and of their harmonics, relative
     film: FloatArray  # the film's place, um; the figure is that of the mean place
+    display: FloatArray  # the same of the fringes' harmonics alone
 
     @property
     def x_to_y(self) -> FloatArray:
@@ -266,30 +267,27 @@ def frame_effects(
     light: FloatArray | float = 1.0,
     harmonics: FloatArray | None = None,
 ) -> FrameEffects:
-    """The effects of errors of single frames.
-
-    `light` (2, n) is that of the points, and `harmonics` (2, 2) are the second and third of x and of y, all over the
-    fringes' amplitude.
-    """
+    """Of single frames; `light` (2, n) and `harmonics` (2, 2), second and third of x and y, over the amplitude."""
     scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
-    light = np.broadcast_to(light, bench.screen_mm.shape)
-    harmonics = np.zeros((2, 2)) if harmonics is None else harmonics
-    effects: tuple[list[FloatArray], ...] = ([], [], [])
+    light, orders = np.broadcast_to(light, bench.screen_mm.shape), (2, 3)
+    effects: tuple[list[FloatArray], ...] = ([], [], [], [])
     for axis, shifts in enumerate(shifts_rad):
         angle = bench.screen_mm[axis] / scale + phase.centre_phase_rad(optics.pattern)
         _, cosine, sine = phase.step_weights(shifts)
         for k, shift in enumerate(shifts):
             # the frame's error over the fringes' amplitude turns the phasor
             turned = -scale * (cosine[k] * np.sin(angle) - sine[k] * np.cos(angle))
-            second, third = (h * np.cos(k * (angle + shift)) for k, h in zip((2, 3), harmonics[axis], strict=True))
-            wave = np.cos(angle + shift) + second + third
-            errors = light[axis], wave, -np.sin(angle + shift) * moves[axis] / scale
+            at = angle + shift
+            wave, display = np.cos(at), np.zeros_like(at)
+            for order, share in zip(orders, (0.0, 0.0) if harmonics is None else harmonics[axis], strict=True):
+                wave, display = wave + share * np.cos(order * at), display - order * share * np.sin(order * at)
+            errors = light[axis], wave, -np.sin(at) * moves[axis] / scale, display * moves[axis] / scale
             for effect, error in zip(effects, errors, strict=True):
                 off = np.zeros_like(bench.screen_mm)
                 off[axis] = turned * error
                 effect.append(bench.solve(bench.geometry(), off, linear=True) - bench.surface.parameters)
-    level, swing, film = (np.stack(effect, axis=1) for effect in effects)
-    return FrameEffects(level, swing, film - film.mean(axis=1, keepdims=True))
+    level, swing, film, display = (np.stack(effect, axis=1) for effect in effects)
+    return FrameEffects(level, swing, film - film.mean(axis=1, keepdims=True), display)
 
 
 def frame_sources(
@@ -297,8 +295,9 @@ def frame_sources(
 ) -> Iterator[Source]:
     """What differs from frame to frame: the light, by `light`, and the film, by `film_um`."""
     effects = frame_effects(bench, optics, shifts_rad)
-    told_mm = light * (effects.level + effects.swing)
-    yield Source("light_relative", "light of each frame", light, told_mm, False, False)
+    yield Source(
+        "light_relative", "light of each frame", light, light * (effects.level + effects.swing), False, False
+    )
     says = "motion of the film from frame to frame that no laser has told"
     yield Source("film_um", says, film_um, film_um * effects.film, False, False)
 

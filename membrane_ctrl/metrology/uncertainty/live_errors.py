@@ -8,7 +8,7 @@ the first one near the film's present displacement.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,8 @@ class FramesSeen:
 
     level: FloatArray  # (2 N,): relative
     swing: FloatArray  # (2 N,): relative
-    moved_um: FloatArray  # (2 N,): the film, beyond what the phases were corrected for
+    told_um: FloatArray  # (2 N,): the film, as the phases were corrected for
+    moved_um: FloatArray  # (2 N,): the film beyond that
     harmonics: FloatArray  # (2, 2): second and third of x and of y over the amplitude: the display's response
     waves_rad: FloatArray  # (2, n): what all that adds to the phases of the points
 
@@ -52,6 +53,8 @@ class LiveErrors:
     common_mm2: FloatArray  # (36, 36): covariance of what all cycles share; NaN if the spread is unknown or too wide
     # (36, 36): covariance of what is left of that in a change, per um^2 of the film's displacement between the cycles
     per_um2: FloatArray
+    # (36, 36): covariance of what the geometry makes of a film that was told to be 1 um deeper in x than in y
+    told_um2: FloatArray
 
     @classmethod
     def of(
@@ -74,18 +77,25 @@ class LiveErrors:
         vertex = budget.vertex_source(bench, 1.0, "").effects_mm[:, 0]
         none = np.zeros((vertex.size, vertex.size))
         if spread is None:
-            return cls(frames, vertex, none + np.nan, none)
+            return cls(frames, vertex, none + np.nan, none, none)
         try:
             here = _shared(bench, spread, blur_px)
             per_um = (_shared(budget.moved_film(bench, _FAR_UM), spread, blur_px) - here) / _FAR_UM
+            x_mm, y_mm = (budget.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1))
+            told = _of_geometry(replace(bench, screen_mm=np.stack([x_mm[0], y_mm[1]])), spread)
+            told = (told - here[:, : told.shape[1]]) / _FAR_UM
         except ArithmeticError:  # a fit at the spread's end fails
-            return cls(frames, vertex, none + np.nan, none)
-        return cls(frames, vertex, here @ here.T + left @ left.T, per_um @ per_um.T)
+            return cls(frames, vertex, none + np.nan, none, none)
+        return cls(frames, vertex, here @ here.T + left @ left.T, per_um @ per_um.T, told @ told.T)
 
     def correction_mm(self, seen: FramesSeen) -> FloatArray:
         """(36,) that the errors of the frames added to the parameters."""
         effects = self.frames
-        return np.asarray(effects.level @ seen.level + effects.swing @ seen.swing + effects.film @ seen.moved_um)
+        # the phases were corrected for the told motion as if the fringes were pure sinusoids
+        display = effects.display @ (seen.told_um + seen.moved_um)
+        return np.asarray(
+            effects.level @ seen.level + effects.swing @ seen.swing + effects.film @ seen.moved_um + display
+        )
 
     def own_mm2(
         self, seen: FramesSeen, readings_um: FloatArray, laser_noise_um: float, moved_um: float
@@ -106,17 +116,22 @@ class LiveErrors:
             x_to_y_um * self.frames.x_to_y[:, None],
             consistency.vertex_um(readings_um, laser_noise_um) * self.vertex[:, None],
         ]
-        return np.asarray(sum(effect @ effect.T for effect in effects) + moved_um**2 * self.per_um2)
+        told_um = float(np.subtract(*(part.mean() for part in np.split(seen.told_um, 2))))
+        shared_mm2 = moved_um**2 * self.per_um2 + told_um**2 * self.told_um2
+        return np.asarray(sum(effect @ effect.T for effect in effects) + shared_mm2)
 
 
 def _shared(bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float) -> FloatArray:
     """Effects (36, k) of what all cycles share. Raises ArithmeticError if a fit at the spread's end fails."""
     sources = [
-        *budget.geometry_sources(bench, spread),
         *budget.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
         budget.blur_source(bench, blur_px),
     ]
-    return np.concatenate([source.effects_mm for source in sources], axis=1)
+    return np.concatenate([_of_geometry(bench, spread), *(source.effects_mm for source in sources)], axis=1)
+
+
+def _of_geometry(bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread) -> FloatArray:
+    return np.concatenate([source.effects_mm for source in budget.geometry_sources(bench, spread)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -270,9 +285,7 @@ def frames_seen(
         # of the other axis: uneven light leaves waves in the scene of its own frames, which would hide half of it
         level, cosine, sine = scenes[1 - axis]
         swing, slope = np.hypot(cosine, sine), sensitivity_rad_per_um[axis]
-        wave = np.exp(1j * shifts_rad[axis])[:, None] * np.exp(1j * phase_rad[axis])
-        if told_um.any():
-            wave = wave * np.exp(1j * told_um[axis][:, None] * slope)
+        wave = np.exp(1j * (shifts_rad[axis][:, None] + phase_rad[axis] + told_um[axis][:, None] * slope))
         # level, swing, step, film, the display's harmonics (`frames.evidence`), and the frame
         table = np.empty((len(frames), _COLUMNS + 1, level.size))
         table[:, 0], table[:, 1], table[:, 2] = level, swing * wave.real, swing * wave.imag
@@ -287,18 +300,22 @@ def frames_seen(
         found = solved * scale[:, -1:] / scale[:, :-1]
         # of errors of light and place alone: what differs from frame to frame
         differs = (found - found.mean(axis=0)) * _DIFFERS
-        added = weights[axis, 1:] @ np.einsum("kp,kpn->kn", differs, table[:, :-1])
-        unit = np.exp(1j * phase_rad[axis])
-        waves.append((added[1] * unit.real - added[0] * unit.imag) / (swing * abs(found[:, 1].mean())))
         amplitude = np.hypot(found[:, 1], found[:, 2])
         relative = found[:, 3:] / np.maximum(amplitude, 1e-9)[:, None]
+        # and of the harmonics, which move with the film as well
+        second, third = relative[:, 1:].mean(axis=0)
+        display = -(2 * second * square.imag + 3 * third * (square * wave).imag) * swing * slope
+        errors = np.einsum("kp,kpn->kn", differs, table[:, :-1]) + told_um[axis][:, None] * display
+        added = weights[axis, 1:] @ errors
+        unit = np.exp(1j * phase_rad[axis])
+        waves.append((added[1] * unit.real - added[0] * unit.imag) / (swing * abs(found[:, 1].mean())))
         out.append(np.stack([found[:, 0], amplitude, *relative.T]))
     shown = np.stack(out, axis=1)  # (5, 2, N): level, swing, film, harmonics
     means = shown.mean(axis=2)
     about = shown[:3] - means[:3, :, None]
     about[:2] /= means[:2, :, None]
     level, swing, moved_um = about.reshape(3, -1)
-    return FramesSeen(level, swing, moved_um, means[3:].T, np.stack(waves))
+    return FramesSeen(level, swing, told_um.ravel(), moved_um, means[3:].T, np.stack(waves))
 
 
 def _rms(*parts: FloatArray) -> float:
