@@ -1,19 +1,23 @@
-"""Results of a calibration, as a table for JSON and as lines for people."""
+"""Results of a calibration, as a table for JSON, as lines for people, and as the geometry's file."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import diagnose, parameters, propagate, solve, verdict
+from membrane_ctrl.metrology.calibrate import diagnose, drift, parameters, propagate, residuals, solve, verdict
+from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import users
+from membrane_ctrl.model.files import users, write_text_atomic
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
@@ -181,3 +185,39 @@ def _means(solution: solve.Solution, index: int, axis: int, edges: tuple[FloatAr
     total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
     summed = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis])[0]
     return np.divide(1e3 * summed, total, out=np.full_like(total, np.nan), where=total > 0)
+
+
+def write_geometry(
+    path: Path,
+    solution: solve.Solution,
+    problem: solve.Problem,
+    optics: OpticsConfig,
+    findings: Sequence[verdict.CalibrationFinding],
+) -> str:
+    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
+    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
+    slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
+    noises = [
+        drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
+        for state, phases in films
+    ]
+    origin = solve.Origin(
+        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        sets=tuple(phases.name for phases in problem.sets),
+        screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
+        slope_residual_urad=1e6 * float(np.median(slopes)),
+        slope_noise_urad=float(np.median(noises)),
+        condition=propagate.condition_number(solution),
+        notes=tuple(finding.says for finding in findings),
+    )
+    tables = solve.tables_of(solution, optics, origin)
+    with errors.writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
+    return str(tables["calibration"]["hash"])
+
+
+def _slope_residual(solution: solve.Solution, phases: residuals.SetPhases, index: int) -> float:
+    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
+    fit = solve.fit_on(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
+    return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))

@@ -6,32 +6,34 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
-from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of
+from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of, write_geometry
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
-from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.metrology.bins import BinGrid
-from membrane_ctrl.metrology.calibrate import drift, propagate, residuals, ring_pose, separable, verdict
+from membrane_ctrl.measure.capture_set import CaptureSet, read_head, read_set
+from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
+from membrane_ctrl.metrology import phase
+from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
+from membrane_ctrl.metrology.calibrate import lens, residuals, ring_pose, separable, verdict
 from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
-from membrane_ctrl.metrology.calibrate.solve import Origin, Problem, Solution, slope_residual, solve, tables_of
-from membrane_ctrl.metrology.checked import Checked
+from membrane_ctrl.metrology.calibrate.solve import Problem, solve
+from membrane_ctrl.metrology.checked import Checked, absolute_phases
+from membrane_ctrl.metrology.frames import evidence
+from membrane_ctrl.metrology.frames.frame_stack import bin_frames
 from membrane_ctrl.metrology.full import FilmMotion, bin_figure
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import users, write_text_atomic
 
 # A capture set's bins as screen points with their noise, for the calibration.
 
 _NO_FILM = "an artefact, as all sets are: a calibration needs a set of the film, whose figure it is for"
+_SAME_FILM_UM = 20.0  # apart: a film's change of figure is then known to a tenth of a micrometre
 _MOTION_UNSEEN_UM = 100.0  # without a laser; the fringes find it to some micrometres
 
 
@@ -117,7 +119,11 @@ def calibrate_command(options: CalibrateOptions) -> int:
             findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
     usable = solution is not None and not any(finding.fatal for finding in findings)
-    written = _write(options.out, solution, problem, bundle, findings) if usable and solution is not None else ""
+    written = (
+        write_geometry(options.out, solution, problem, bundle.optics, findings)
+        if usable and solution is not None
+        else ""
+    )
     if solution is not None and options.pictures:
         path = options.out.with_name(f"{options.out.stem}-residuals.png")
         with errors.writing(path):  # also for a refused solution, where it helps most
@@ -156,24 +162,42 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     Raises InputError for an invalid set or one whose rig differs from that of the first; RejectedError for a
     set without a figure.
     """
-    figures = Figures(None if geometry is None else file.read_geometry(geometry))
+    stated = None if geometry is None else file.read_geometry(geometry)
+    figures = Figures(stated)
     if len(set(folders)) < len(folders):
         raise errors.InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
+    used: list[Path] = []
+    elsewhere: list[tuple[Path, residuals.SetPhases, file.ScreenMovedTable]] = []
     notes: list[str] = []
     edges: list[FloatArray] = []
-    for folder in terminal.counted(folders, "sets"):
-        figure = figures.of(folder)
-        phases = phases_of(folder.name, figure.checked, figure.head.optics)
-        sets.append(replace(phases, artefact=figure.head.artefact))
-        benches.append(figure.head.optics)
+    heads = {folder: read_head(folder, stated) for folder in folders}
+    # those with the screen in its place first: the others belong to them
+    for folder in terminal.counted(sorted(folders, key=lambda each: heads[each].screen_moved is not None), "sets"):
+        head = heads[folder]
+        if head.artefact == "screen":
+            phases = phases_of_screen(read_set(folder, stated))
+        else:
+            figure = figures.of(folder)
+            head = figure.head
+            phases = replace(phases_of(folder.name, figure.checked, head.optics), artefact=figure.artefact)
+            notes += [f"{folder.name}: {head.files[f.frame]} omitted: {f.reason}" for f in figure.checked.flags]
+            if head.artefact is None and (seen := edges_of(figure)) is not None:
+                edges.append(seen)
+        bench = head.optics.model_copy(update={"geometry": head.before_move})
+        if head.screen_moved is not None:
+            if used:
+                _same_rig(used[0], benches[0], folder, bench, films=False)
+            elsewhere.append((folder, phases, head.screen_moved))
+            continue
+        sets.append(phases)
+        benches.append(bench)
+        used.append(folder)
         first = next((k for k, phases in enumerate(sets) if phases.artefact is None), 0)
-        _same_rig(folders[first], benches[first], folder, benches[-1], sets[first].artefact is figure.head.artefact)
-        if figure.head.artefact is None and (seen := edges_of(figure)) is not None:
-            edges.append(seen)
-        files = figure.head.files
-        notes += [f"{folder.name}: {files[flag.frame]} omitted: {flag.reason}" for flag in figure.checked.flags]
+        _same_rig(used[first], benches[first], folder, bench, sets[first].artefact is head.artefact)
+    for each in elsewhere:
+        _join(sets, *each)
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     if not films:
         raise errors.InputError(f"{folders[0]}: {_NO_FILM}")
@@ -184,6 +208,61 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
     return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), tuple(edges))
+
+
+def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
+    """The bins that see the screen itself. Raises RejectedError if they show none."""
+    head, stack = capture.head, stack_of(capture)
+    binned = bin_frames(stack, 2**head.optics.camera.bits - 1)
+    pattern, geometry = head.optics.pattern, Geometry.from_config(head.optics)
+    try:
+        view = evidence.look(stack, binned, set(stack.unusable))
+        phase_rad = absolute_phases(stack, binned, view, pattern)
+        index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
+        grid, screen_mm = BinGrid(geometry, head.optics.camera, binned.bin_px), phase.screen_mm(phase_rad, pattern)
+        place = grid.column_px[index], grid.row_px[index], screen_mm.reshape(2, -1)[:, index]
+        screen = lens.screen_seen(geometry, *place)
+    except (ValueError, evidence.NoFigureError) as error:
+        raise errors.RejectedError(f"{head.folder}: rejected: {error}") from None
+    noise = pixel_sigma_adu(head.optics.camera.noise_adu) / binned.bin_px
+    shares = [phase.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]
+    swing = view.swing_adu.reshape(2, -1)[:, index]
+    sigma_mm = phase.mm_per_rad(pattern) * np.hypot(*(np.array(shares)[:, None] / swing)) / math.sqrt(2)
+    name, where = head.folder.name, (residuals.ANYWHERE,)
+    return residuals.SetPhases(name, *place, sigma_mm, math.nan, artefact=screen, elsewhere=where)
+
+
+def _join(
+    sets: list[residuals.SetPhases], folder: Path, phases: residuals.SetPhases, moved: file.ScreenMovedTable
+) -> None:
+    """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if there is none."""
+    films = [k for k, each in enumerate(sets) if each.artefact is None and phases.artefact is None]
+    apart_um = [abs(phases.displacement_um - sets[k].displacement_um) for k in films]
+    if not any(apart <= _SAME_FILM_UM for apart in apart_um):
+        raise errors.InputError(
+            f"{folder / 'capture.toml'}: screen_moved: needs a set of the film with the screen in its place, "
+            f"the laser's readings within {_SAME_FILM_UM:.0f} um"
+        )
+    k = films[int(np.nanargmin(apart_um))]
+    base, deeper_um = sets[k], phases.displacement_um - sets[k].displacement_um
+    known = residuals.Elsewhere(
+        moved.shift_mm,
+        moved.shift_sigma_mm,
+        moved.turn_sigma_deg,
+        deeper_um,
+        phases.motion_um,
+        phases.motion_sigma_um,
+    )
+    before = np.zeros(base.sigma_mm.size, int) if base.screen is None else base.screen
+    sets[k] = replace(
+        base,
+        column_px=np.append(base.column_px, phases.column_px),
+        row_px=np.append(base.row_px, phases.row_px),
+        screen_mm=np.hstack([base.screen_mm, phases.screen_mm]),
+        sigma_mm=np.append(base.sigma_mm, phases.sigma_mm),
+        elsewhere=(*base.elsewhere, known),
+        screen=np.append(before, np.full(phases.sigma_mm.size, len(base.elsewhere) + 1)),
+    )
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
@@ -251,32 +330,6 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
         known[LASER.name] = 0.0  # no readings to scale
     rim = Rim.of(bundle.edges_px, radius_mm, options.radius_sigma_mm)
     return Problem(geometry, bundle.sets, sigmas(known), references, radius_mm, rim)
-
-
-def _write(
-    path: Path, solution: Solution, problem: Problem, bundle: Bundle, findings: Sequence[verdict.CalibrationFinding]
-) -> str:
-    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
-    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
-    slopes = [slope_residual(solution, problem.sets[k], k) for k in problem.films]
-    noises = [
-        drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
-        for state, phases in films
-    ]
-    origin = Origin(
-        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
-        sets=tuple(phases.name for phases in problem.sets),
-        screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
-        slope_residual_urad=1e6 * float(np.median(slopes)),
-        slope_noise_urad=float(np.median(noises)),
-        condition=propagate.condition_number(solution),
-        notes=tuple(finding.says for finding in findings),
-    )
-    tables = tables_of(solution, bundle.optics, origin)
-    with errors.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
-    return str(tables["calibration"]["hash"])
 
 
 def _progress() -> Any:

@@ -20,9 +20,11 @@ CoarserOption = Annotated[
 ArtefactOption = Annotated[
     str,
     typer.Option(
-        metavar="FORM", help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in the mirror's place, mm."
+        metavar="FORM",
+        help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in its place, or screen:DISTANCE itself, mm.",
     ),
 ]
+ScreenMovedOption = Annotated[float, typer.Option(help="Put the screen this much nearer to the mirror, mm.")]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -210,6 +212,7 @@ def simulate(
     interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
     coarser_mm: CoarserOption = None,
     artefact: ArtefactOption = "",
+    screen_moved_mm: ScreenMovedOption = 0.0,
     track: Annotated[
         int, typer.Option(min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full.")
     ] = 0,
@@ -239,6 +242,7 @@ def simulate(
         interval_s=interval_s,
         coarser_mm=tuple(coarser_mm or ()),
         artefact=artefact,
+        screen_moved_mm=screen_moved_mm,
         track=track,
         rate_hz=rate_hz,
     )

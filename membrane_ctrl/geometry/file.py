@@ -6,14 +6,19 @@ numbers, which results and runs name; a file with edited numbers is refused.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 import tomli_w
+from pydantic import Field
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import sight, toml_file
+from membrane_ctrl.config.optics import CameraPoseConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
+from membrane_ctrl.metrology.optics.surface import Artefact
 from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model.arrays import FloatArray
 
 Table = TypeVar("Table", bound=Section)
 
@@ -194,3 +199,65 @@ def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = Tru
     found = sight.doubt(optics, depth_known)
     if found is not None and found.hopeless:
         raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")
+
+
+# What a capture set says of its bench beyond the geometry.
+
+_Length = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class ArtefactTable(Section):
+    """The `[artefact]` table: what is seen instead of the film."""
+
+    form: Literal["flat", "sphere", "screen"]
+    curvature_radius_mm: _Length | None = None  # of a concave sphere
+    curvature_radius_sigma_mm: _Length | None = None
+    form_sigma_um: Annotated[float, Field(ge=1e-3, le=1e3)] = 0.1  # of each Zernike term
+    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0  # above the film's vertex at the reference displacement
+    vertex_sigma_mm: _Length = 1.0
+
+    def artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
+        """The surface, over its disc, or the screen itself. Raises InputError."""
+        if self.form == "screen":
+            if len(self.model_fields_set) > 1:
+                raise errors.InputError(f"{path}: artefact: the screen itself needs nothing but its form")
+            return self.form
+        curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
+        for name, value in (("curvature_radius_mm", curvature), ("curvature_radius_sigma_mm", spread)):
+            if (value is None) != (self.form == "flat"):
+                says = "a sphere needs it" if value is None else "a flat has none"
+                raise errors.InputError(f"{path}: artefact.{name}: {says}")
+        known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
+        known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
+        if curvature is None or spread is None:
+            return Artefact(0.0, 0.0, **known)
+        if curvature <= radius_mm:
+            raise errors.InputError(
+                f"{path}: artefact.curvature_radius_mm = {curvature:g} must exceed mirror.radius_mm"
+            )
+        return Artefact(1 / curvature, spread / curvature**2, **known)
+
+
+class ScreenMovedTable(Section):
+    """The `[screen_moved]` table: the screen stood elsewhere than `[geometry]` says."""
+
+    shift_mm: tuple[float, float, float]  # along s_x, along s_y, towards the mirror, as measured
+    shift_sigma_mm: _Length = 1.0  # of its length
+    turn_sigma_deg: Annotated[float, Field(gt=0, le=30)] = 0.5  # of its direction; and how parallel the screen stayed
+
+
+def screen_elsewhere(
+    geometry: GeometryConfig, shift_mm: tuple[float, float, float], turn: FloatArray | None = None
+) -> GeometryConfig:
+    """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from world to world."""
+    pinhole, rotation, origin, s_x, s_y = sight.poses(geometry)
+    origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])
+    if turn is not None:
+        s_x, s_y = turn @ s_x, turn @ s_y
+    vectors = {"origin_mm": origin, "s_x": s_x, "s_y": s_y}
+    screen = (geometry.screen or ScreenPoseConfig()).model_copy(
+        update={name: tuple(value.tolist()) for name, value in vectors.items()}
+    )
+    camera = CameraPoseConfig(position_mm=pinhole.tolist(), rotation=rotation.tolist())
+    short = dict.fromkeys(("a_mm", "b_mm", "alpha_deg"))
+    return geometry.model_copy(update={**short, "camera": camera, "screen": screen})

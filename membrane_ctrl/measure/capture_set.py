@@ -19,7 +19,14 @@ from pydantic import Field
 from firmware_iface.roles import Pattern
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, origin_of
+from membrane_ctrl.geometry.file import (
+    ArtefactTable,
+    GeometryFile,
+    GeometryOrigin,
+    ScreenMovedTable,
+    origin_of,
+    screen_elsewhere,
+)
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.optics.surface import Artefact
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
@@ -46,35 +53,6 @@ class FrameRow(Section):
     displacement_um: float | None = None
 
 
-_Length = Annotated[float, Field(gt=0, le=1e6)]
-
-
-class ArtefactTable(Section):
-    """The `[artefact]` table: what stands in the mirror's place."""
-
-    form: Literal["flat", "sphere"]
-    curvature_radius_mm: _Length | None = None  # of a concave sphere
-    curvature_radius_sigma_mm: _Length | None = None
-    form_sigma_um: Annotated[float, Field(ge=1e-3, le=1e3)] = 0.1  # of each Zernike term
-    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0  # above the film's vertex at the reference displacement
-    vertex_sigma_mm: _Length = 1.0
-
-    def artefact(self, radius_mm: float, path: Path) -> Artefact:
-        """The surface, over its disc. Raises InputError."""
-        curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
-        for name, value in (("curvature_radius_mm", curvature), ("curvature_radius_sigma_mm", spread)):
-            if (value is None) != (self.form == "flat"):
-                says = "a sphere needs it" if value is None else "a flat has none"
-                raise InputError(f"{path}: artefact.{name}: {says}")
-        known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
-        known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
-        if curvature is None or spread is None:
-            return Artefact(0.0, 0.0, **known)
-        if curvature <= radius_mm:
-            raise InputError(f"{path}: artefact.curvature_radius_mm = {curvature:g} must exceed mirror.radius_mm")
-        return Artefact(1 / curvature, spread / curvature**2, **known)
-
-
 class CaptureFile(Section):
     """The content of `capture.toml`."""
 
@@ -87,6 +65,7 @@ class CaptureFile(Section):
     camera: schema.CameraConfig
     mirror: schema.MirrorConfig
     artefact: ArtefactTable | None = None
+    screen_moved: ScreenMovedTable | None = None
     frames: tuple[FrameRow, ...]
 
 
@@ -106,7 +85,9 @@ class CaptureHead:
     pressure_pa: float  # gauge pressure during the set; NaN where not stated
     ignored: tuple[str, ...]  # unknown keys of the file
     geometry: GeometryOrigin  # origin of the geometry in `optics`
-    artefact: Artefact | None = None  # what stands in the mirror's place; None: the film
+    artefact: Artefact | Literal["screen"] | None = None  # what is seen instead of the film
+    screen_moved: ScreenMovedTable | None = None  # by how much the screen stood elsewhere; `optics` has it there
+    before_move: schema.GeometryConfig | None = None  # the geometry without that
 
     @property
     def fringes(self) -> list[int]:
@@ -170,11 +151,15 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
     if geometry is not None:
         optics = geometry.over(optics)
+    optics = _with_reference_displacement(optics, content.frames[0].displacement_um if reference is None else None)
+    before, moved = optics.geometry, content.screen_moved
+    if moved is not None:
+        optics = optics.model_copy(update={"geometry": screen_elsewhere(before, moved.shift_mm)})
     return CaptureHead(
         folder=folder,
         kind=content.kind,
         reference=reference,
-        optics=_with_reference_displacement(optics, content.frames[0].displacement_um if reference is None else None),
+        optics=optics,
         bits_stated=bits_stated,
         files=tuple(row.file for row, _ in rows),
         patterns=tuple(pattern for _, pattern in rows),
@@ -184,6 +169,8 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         ignored=ignored,
         geometry=origin_of(optics) if geometry is None else geometry.origin,
         artefact=None if content.artefact is None else content.artefact.artefact(content.mirror.radius_mm, path),
+        screen_moved=moved,
+        before_move=before,
     )
 
 

@@ -13,6 +13,7 @@ from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, c
 from membrane_ctrl.metrology.frames import frame_stack, integrity
 from membrane_ctrl.metrology.frequencies import check_frequencies
 from membrane_ctrl.metrology.full import BinFigure, FullResult, bin_figure, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.optics.surface import Artefact
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
 
@@ -148,6 +149,11 @@ class SetFigure:
     reason: str
     time_s: float
     displacement_um: float
+
+    @property
+    def artefact(self) -> Artefact | None:
+        """What stood in the mirror's place; None: the film."""
+        return None if self.head.artefact == "screen" else self.head.artefact
 
     def bench(self) -> TrialBench:
         """The set's bench for Monte Carlo trials."""

@@ -6,11 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from membrane_ctrl.config import sight
+from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import Config, OpticsConfig
-from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.geometry.file import read_geometry, screen_elsewhere
 from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spec
 
 
@@ -36,7 +40,8 @@ class SimulateOptions:
     sets: int
     interval_s: float
     coarser_mm: tuple[float, ...] = ()
-    artefact: str = ""  # "flat:RADIUS" or "sphere:CURVATURE:RADIUS", mm
+    artefact: str = ""  # "flat:RADIUS", "sphere:CURVATURE:RADIUS" or "screen:DISTANCE", mm
+    screen_moved_mm: float = 0.0  # towards the mirror
     track: int = 0  # frames of a tracking set
     rate_hz: float = 20.0
 
@@ -66,8 +71,19 @@ def simulate_command(options: SimulateOptions) -> int:
 def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     """The set described by the options. Raises ValueError naming an impossible one."""
     optics = _optics(options)
+    if (options.artefact or options.screen_moved_mm) and (options.sets > 1 or options.track):
+        raise ValueError("--artefact, --screen-moved-mm: one set, for `calibrate`")
+    if options.artefact.startswith("screen:"):
+        return _of_screen(options, optics)
     if options.artefact:
         return _of_artefact(options, optics)
+    if options.screen_moved_mm:
+        return _with_screen_moved(options, optics)
+    return _of_film(options, optics)
+
+
+def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
+    """A set of the film, or the first of a run."""
     radius_mm = optics.mirror.radius_mm
     twin = options.config.twin
     mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson)
@@ -113,8 +129,6 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
         raise ValueError(f"--artefact {options.artefact}: sizes are numbers, mm") from None
     if len(sizes) != {"flat": 1, "sphere": 2}.get(form) or not 0 < radius_mm < curvature_mm:
         raise ValueError(f"--artefact {options.artefact}: flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS, mm")
-    if options.sets > 1 or options.track:
-        raise ValueError("--artefact: one set, which is not of a film")
     table: dict[str, str | float] = {
         "form": form,
         "vertex_sigma_mm": _VERTEX_KNOWN_MM,
@@ -127,6 +141,50 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
     mirror = type(optics.mirror)(radius_mm=radius_mm, analysis_radius_mm=_USED * radius_mm)
     spec = _bare(options, optics.model_copy(update={"mirror": mirror}), shape)
     return replace(spec, artefact=table, laser=False)
+
+
+_SHIFT_KNOWN_MM, _TURN_KNOWN_DEG = 0.05, 0.5  # of a screen on a rail
+
+
+def _with_screen_moved(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
+    """The film with the screen elsewhere than stated, which is known as the file states it."""
+    shift_mm = np.array([0.0, 0.0, options.screen_moved_mm])
+    table = {"shift_mm": shift_mm.tolist(), "shift_sigma_mm": _SHIFT_KNOWN_MM, "turn_sigma_deg": _TURN_KNOWN_DEG}
+    # one move of one bench, whatever the set's own seed
+    rng = np.random.default_rng(int(abs(options.screen_moved_mm)))
+    rail, turn = (_turn(np.radians(_TURN_KNOWN_DEG) * rng.normal(size=3)) for _ in range(2))
+    x, y, z = rail @ shift_mm + _SHIFT_KNOWN_MM * rng.normal(size=3)
+    there = screen_elsewhere(optics.geometry, (x, y, z), turn)
+    spec = _of_film(options, optics.model_copy(update={"geometry": there}))
+    return replace(spec, screen_moved=table, stated_geometry=spec.stated_geometry or optics.geometry)
+
+
+_TILTED_RAD = np.radians(25.0)
+
+
+def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
+    """The screen itself before the camera, tilted to any side. Raises ValueError for another text."""
+    try:
+        distance_mm = float(options.artefact.removeprefix("screen:"))
+    except ValueError:
+        raise ValueError(f"--artefact {options.artefact}: screen:DISTANCE, mm") from None
+    pinhole, (right, down, forward), *_ = sight.poses(optics.geometry)
+    side, roll = np.random.default_rng(options.seed).uniform(0, 2 * math.pi, 2)
+    turn = _turn(_TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)) @ _turn(roll * forward)
+    before = {"origin_mm": pinhole + distance_mm * forward, "s_x": turn @ right, "s_y": -turn @ down}
+    screen = (optics.geometry.screen or ScreenPoseConfig()).model_copy(
+        update={name: tuple(value.tolist()) for name, value in before.items()}
+    )
+    there = screen_elsewhere(optics.geometry, (0.0, 0.0, 0.0)).model_copy(update={"screen": screen})
+    shape = simulation_spec.leaning(math.inf, optics.mirror.radius_mm, 0.0, 0.0)
+    spec = _bare(options, optics.model_copy(update={"geometry": there}), shape)
+    stated = spec.stated_geometry or optics.geometry
+    return replace(spec, artefact={"form": "screen"}, laser=False, stated_geometry=stated)
+
+
+def _turn(vector: FloatArray) -> FloatArray:
+    """Matrix (3, 3) of a turn about a vector by its length."""
+    return np.asarray(cv2.Rodrigues(vector)[0], np.float64)
 
 
 def _optics(options: SimulateOptions) -> OpticsConfig:

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology import bins, motion, reconstruct
 from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
 from membrane_ctrl.metrology.optics.geometry import Geometry
@@ -260,12 +260,19 @@ def _absolute(
     """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
     if anchor is not None:
         return _followed(view, anchor)
+    return absolute_phases(stack, binned, view, optics.pattern)
+
+
+def absolute_phases(
+    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.BinView, pattern: PatternConfig
+) -> FloatArray:
+    """Those of a set with Gray code, by that alone."""
     out = np.empty_like(view.phase_rad)
     for k, axis in enumerate(AXES):
         # the fringes' mean is half the light, which no single frame can spoil
         bits = binned.means[stack.gray(axis)] > view.light
         phase = orders(view.phase_rad[k], bits, view.mask).phase_rad
-        out[k] = np.where(inside_pattern(phase, optics.pattern), phase, np.nan)
+        out[k] = np.where(inside_pattern(phase, pattern), phase, np.nan)
     return out
 
 

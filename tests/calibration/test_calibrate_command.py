@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
+from membrane_ctrl.geometry.file import screen_elsewhere
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
@@ -253,6 +255,91 @@ def test_artefacts_alone_are_refused(sphere: Path, tmp_path: Path, capsys: pytes
     assert "a calibration needs a set of the film" in capsys.readouterr().err
     assert run(["film", str(sphere), "--out", str(tmp_path / "film")]) == 2
     assert "sphere/capture.toml: artefact: a set of no film" in capsys.readouterr().err
+
+
+SHIFT_MM = (0.0, 0.0, -300.0)
+
+
+@pytest.fixture(scope="module")
+def far_and_near(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The film with the screen further away, and the screen itself, tilted to two sides."""
+    root, rail = tmp_path_factory.mktemp("screens"), {"shift_mm": list(SHIFT_MM), "shift_sigma_mm": 0.05}
+    stated = STATED.model_copy(update={"reference_displacement_um": 0.0})
+    there = screen_elsewhere(TRUE, (0.03, -0.04, -299.95))
+    spec = SimulationSpec(
+        OpticsConfig(geometry=there, camera=CAMERA),
+        FILM,
+        motion=Motion(start_um=1.5),
+        stated_geometry=stated,
+        screen_error=LEANS,
+        screen_moved=rail,
+        seed=11,
+    )
+    simulate_set(root / "far", spec)
+    truth, hand, pixels = root / "truth.toml", root / "hand.toml", CAMERA.model_dump(exclude_none=True)
+    truth.write_text(tomli_w.dumps({"optics": {"geometry": TRUE.model_dump(exclude_none=True), "camera": pixels}}))
+    hand.write_text(tomli_w.dumps({"geometry": stated.model_dump(exclude_none=True)}))
+    for seed in ("5", "8"):
+        words = ["--config", str(truth), "--stated", str(hand), "--artefact", "screen:900", "--seed", seed]
+        assert run(["simulate", str(root / f"screen{seed}"), *words]) == 0
+    return [root / "far", root / "screen5", root / "screen8"]
+
+
+def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag(
+    folders: list[Path],
+    far_and_near: list[Path],
+    calibrated: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    sets = [*map(str, far_and_near), *map(str, folders)]  # in any order
+    assert run(["calibrate", *sets, "--out", str(tmp_path / "g.toml"), "--json"]) == 0
+    report, alone = json.loads(capsys.readouterr().out), json.loads(calibrated.read_text())
+    assert report["findings"] == []
+    assert [row["surface"] for row in report["sets"]] == ["screen", "screen", *["film"] * 5]
+    assert all(row["noise_ratio"] < 1.2 for row in report["sets"])
+    assert report["uncertainty"]["sag_um"] < 0.65 * alone["uncertainty"]["sag_um"]
+    found = {row["name"]: row for row in report["parameters"]}
+    for name, true in (("a_mm", 2.0), ("b_mm", -2.0), ("alpha_deg", 0.3), ("focal_relative", 0.0), ("bow_mm", 0.0)):
+        assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"], name
+    assert found["focal_relative"]["sigma"] < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("which", "was", "becomes", "says"),
+    [
+        (0, "shift_mm", "shift", "screen_moved.shift_mm"),
+        (0, "shift_sigma_mm = 0.05", "shift_sigma_mm = 0.0", "screen_moved.shift_sigma_mm"),
+        (1, 'form = "screen"', 'form = "screen"\nvertex_mm = 1.0', "the screen itself needs nothing but its form"),
+    ],
+)
+def test_a_screen_that_is_not_described_is_refused(
+    far_and_near: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    which: int,
+    was: str,
+    becomes: str,
+    says: str,
+) -> None:
+    text = (far_and_near[which] / "capture.toml").read_text()
+    assert was in text
+    (tmp_path / "capture.toml").write_text(text.replace(was, becomes, 1))
+    assert run(["calibrate", str(tmp_path), "--out", str(tmp_path / "g.toml")]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_moved_screen_needs_the_film_with_the_screen_in_its_place(
+    folders: list[Path], far_and_near: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far, direct = str(far_and_near[0]), str(far_and_near[1])
+    for beside in ([], [str(folders[0])], [direct]):
+        assert run(["calibrate", far, *beside, "--out", str(tmp_path / "g.toml")]) == 2
+        assert "far/capture.toml: screen_moved: needs a set of the film" in capsys.readouterr().err
+    assert run(["calibrate", direct, "--out", str(tmp_path / "g.toml")]) == 2
+    assert "a calibration needs a set of the film" in capsys.readouterr().err
+    assert run(["film", direct, "--out", str(tmp_path / "film")]) in (2, 3)
+    assert not (tmp_path / "g.toml").exists()
 
 
 def test_a_film_that_moves_within_its_sets_calibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibrate import parameters, propagate, separable, solve
+from membrane_ctrl.metrology.calibrate import parameters, propagate, residuals, separable, solve
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
@@ -138,6 +138,26 @@ def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
         fall = everything - solve.step(others, sigmas).squares - alone
         out.append(LeftOut(k, float(fall), freedom))
     return tuple(out)
+
+
+def elsewhere(solution: solve.Solution) -> list[tuple[int, float]]:
+    """Sets beside which the screen was moved, but not as stated: each with the fall if that place is free."""
+    reduced, out = _reduced(solution), []
+    everything, moved = _squares(np.sum(reduced, axis=0), solution), np.arange(parameters.SCREEN_MOVE)
+    for k, each in enumerate(solution.equations):
+        free = each.sums.copy()
+        phases, state = solution.problem.sets[k], solution.states[k]
+        for sums, known, move in zip(each.elsewhere, phases.elsewhere, state.elsewhere, strict=True):
+            told, sigmas = known.known(solution.problem.references.laser_sigma_um)[:, moved]
+            hand = np.hstack([np.eye(moved.size), (told - move[moved])[:, None]]) / sigmas[:, None]
+            own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
+            without_hand[np.ix_(own, own)] -= hand.T @ hand
+            free += separable.without(without_hand, residuals.MOVED) - separable.without(sums, residuals.MOVED)
+        others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
+        fall = everything - _squares(np.sum(others, axis=0), solution)
+        if chi2.sf(fall, moved.size) < SURE:
+            out.append((k, float(fall)))
+    return out
 
 
 def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:

@@ -13,13 +13,63 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config.schema import CameraConfig
+from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.optics.surface import SeenScreen
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, FloatArray
 
 LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
 LEAST_CORNERS = 12  # of a view
 _WORSE = 3.0  # times the median view's error
 _FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
+_PLANE_OFF = 5e-3  # of a tangent: what the stated lens leaves, far less than a fringe
+_PLANE_SHARE = 0.8
 _NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
+
+
+def screen_seen(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, screen_mm: FloatArray) -> SeenScreen:
+    """Where the screen stands that the camera sees at points (2, n), about, with the stated lens.
+
+    Raises ValueError if no plane is seen.
+    """
+    rays = geometry.rotation @ geometry.rays(column_px, row_px)
+    seen, flat = (rays[:2] / rays[2]).T.copy(), screen_mm.T.copy()
+    if flat.shape[0] <= LEAST_CORNERS:
+        raise ValueError("no screen is seen")
+    # a few bins may have a wrong fringe order
+    good: AnyArray = np.asarray(cv2.findHomography(flat, seen, cv2.RANSAC, _PLANE_OFF)[1]).ravel()
+    if np.mean(good == 1) < _PLANE_SHARE:  # also where there is none
+        raise ValueError("what is seen is not a plane with fringes")
+    keep = good == 1
+    place = np.column_stack([flat[keep], np.zeros(np.count_nonzero(keep))])
+    _, turn, shift = cv2.solvePnP(place, seen[keep], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+    return SeenScreen(np.asarray(shift.ravel(), np.float64), np.asarray(cv2.Rodrigues(turn)[0].T, np.float64))
+
+
+def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray) -> FloatArray:
+    """d ray / d (relative focal length, principal point, k1, k2, p1, p2), (7, 3, m).
+
+    A pixel fixes the distorted point q = ((c, r) - principal) / focal = f(p; k): dp = (df/dp)^-1 (dq - df/dk dk), and
+    the unit vector c of (p, 1) turns by (1 - c c^T) (dp, 0) / |(p, 1)|. Coefficients beyond the first four, if the
+    stated lens has any, count as constants of df/dp only to first order: they are left out there.
+    """
+    c = geometry.rotation @ rays
+    x, y = c[0] / c[2], c[1] / c[2]
+    k1, k2, p1, p2 = (*geometry.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+    r2 = x * x + y * y
+    radial, grows = 1 + k1 * r2 + k2 * r2**2, 2 * (k1 + 2 * k2 * r2)
+    fxx = radial + grows * x * x + 2 * p1 * y + 6 * p2 * x
+    fxy = grows * x * y + 2 * p1 * x + 2 * p2 * y
+    fyy = radial + grows * y * y + 6 * p1 * y + 2 * p2 * x
+    qx = (column_px - geometry.principal_px[0]) / geometry.focal_px
+    qy = (row_px - geometry.principal_px[1]) / geometry.focal_px
+    zero, step = np.zeros_like(x), np.full_like(x, -1 / geometry.focal_px)
+    of_x = np.stack([-qx, step, zero, -x * r2, -x * r2**2, -2 * x * y, -(r2 + 2 * x * x)])
+    of_y = np.stack([-qy, zero, step, -y * r2, -y * r2**2, -(r2 + 2 * y * y), -2 * x * y])
+    det = fxx * fyy - fxy**2
+    px, py = (fyy * of_x - fxy * of_y) / det, (fxx * of_y - fxy * of_x) / det
+    moved = np.stack([px, py, np.zeros_like(px)], axis=1) * c[2]
+    turned = moved - np.sum(moved * c, axis=1, keepdims=True) * c
+    return np.asarray(np.einsum("ij,lim->ljm", geometry.rotation, turned))
 
 
 @dataclass(frozen=True)

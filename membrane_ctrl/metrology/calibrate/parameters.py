@@ -145,12 +145,11 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     hinge = _hinge(f0, o0)
     up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
     rows = stated.screen_axes
-    i, j, k = np.eye(3)
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
-        camera=_turn(i, pitch) @ _turn(j, yaw) @ _turn(k, roll) @ stated.rotation @ up.T,
+        camera=_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
         origin_mm=back @ ((1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]),
-        screen=_turn(i, turn_x) @ _turn(j, turn_y) @ _turn(k, turn_z) @ rows @ back.T,
+        screen=_turns(turn_x, turn_y, turn_z) @ rows @ back.T,
     )
 
 
@@ -169,6 +168,32 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     return out
 
 
+SCREEN_MOVE = (
+    6  # numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, turns about them, degrees
+)
+
+
+def screen_elsewhere(bench: BenchGeometry, turns: list[Poses], move: FloatArray) -> tuple[BenchGeometry, list[Poses]]:
+    """The bench with its screen moved by `move` (6,), and d poses by the parameters of `turns` and by the six."""
+    there, rows = bench.geometry, bench.geometry.screen_axes
+    origin_mm, screen = _moved(there.screen_origin_mm, rows, move)
+    by_turn = screen @ rows.T
+    derivatives = [
+        replace(turn, origin_mm=turn.origin_mm + turn.screen.T @ move[:3], screen=by_turn @ turn.screen)
+        for turn in turns
+    ]
+    for step in 1j * _COMPLEX_STEP * np.eye(SCREEN_MOVE):
+        parts = (part.imag / _COMPLEX_STEP for part in _moved(there.screen_origin_mm, rows, move + step))
+        derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), *parts))
+    moved = replace(there, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1])
+    return replace(bench, geometry=moved), derivatives
+
+
+def _moved(origin_mm: FloatArray, rows: FloatArray, move: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """A screen's origin and rows after a move."""
+    return origin_mm + rows.T @ move[:3], _turns(*np.pi / 180 * move[3:]) @ rows
+
+
 def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     """Unit vector about which alpha turns."""
     across = np.cross(pinhole_mm, origin_mm)
@@ -176,6 +201,12 @@ def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     if length < 1e-6 * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
         raise ValueError("camera and screen are in line with the vertex: alpha is undefined")
     return across / length
+
+
+def _turns(x: Any, y: Any, z: Any) -> AnyArray:
+    """Turns about x, y and z, the last one first."""
+    i, j, k = np.eye(3)
+    return np.asarray(_turn(i, x) @ _turn(j, y) @ _turn(k, z))
 
 
 def _turn(axis: FloatArray, angle: Any) -> AnyArray:

@@ -112,10 +112,11 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
 
     Its set is foreseen from the bench found: rays of the film's set that meet the sphere, with their noise.
     """
-    if len(solution.problem.films) < len(solution.problem.sets):
+    if solution.problem.with_artefact:
         return None
     now = surface_covariance(solution, index)
     phases, surface = solution.problem.sets[index], solution.states[index].surface
+    phases = replace(phases.subset(phases.seen_with(0)), elsewhere=())
     # as deep as the film, so that the fringes fall on the same places of the screen
     curvature_mm = (surface.radius_mm**2 + surface.sag_mm**2) / (2 * surface.sag_mm)
     spread = _SPHERE_KNOWN / curvature_mm

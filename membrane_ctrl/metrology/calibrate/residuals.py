@@ -12,59 +12,27 @@ with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y t
 = c s^2 + map (see `optics.geometry`) and T = E (1 - u N^T / (N u)), which lets the ray run to the face.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.calibrate.parameters import OPTICAL, POSE, BenchGeometry, Poses
+from membrane_ctrl.metrology.calibrate.lens import lens_derivatives
+from membrane_ctrl.metrology.calibrate.parameters import (
+    OPTICAL,
+    POSE,
+    SCREEN_MOVE,
+    BenchGeometry,
+    Poses,
+    screen_elsewhere,
+)
 from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, Surface
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
-
-# Small matrix products as plain loops.
-#
-# A linear algebra library has its own threads, which wait for each other on a machine shared with the control loop:
-# products of 40 by 40 then take five times as long as these loops on one core.
-
-_BLOCK = 512  # columns that stay in the second-level cache
-
-
-@compiled.kernel
-def gram(rows):  # type: ignore[no-untyped-def]
-    """rows @ rows.T of a (c, n) array with many columns."""
-    count, size = rows.shape
-    out = np.zeros((count, count))
-    for first in range(0, size, _BLOCK):
-        last = min(first + _BLOCK, size)
-        for i in range(count):
-            for j in range(i + 1):
-                total = 0.0
-                for k in range(first, last):
-                    total += rows[i, k] * rows[j, k]
-                out[i, j] += total
-    for i in range(count):
-        for j in range(i):
-            out[j, i] = out[i, j]
-    return out
-
-
-@compiled.kernel
-def multiply(table, rows):  # type: ignore[no-untyped-def]
-    """table @ rows of an (a, b) and a (b, n) array with many columns; zeros in the table cost nothing."""
-    out = np.zeros((table.shape[0], rows.shape[1]))
-    for i in range(table.shape[0]):
-        for j in range(table.shape[1]):
-            factor = table[i, j]
-            if factor != 0.0:
-                for k in range(rows.shape[1]):
-                    out[i, k] += factor * rows[j, k]
-    return out
-
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 # of one set: its surface's 36, the height of its vertex, its round terms beyond the 36, and by how much the film was
 # deeper in the x frames than in the y frames
@@ -72,12 +40,42 @@ BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(film_law.BEYOND))
 MOTION = BEYOND.stop
 LOCAL = MOTION + 1
 COLUMNS = LOCAL + OPTICAL
+MOVED = SCREEN_MOVE + 2  # of a screen elsewhere: its move, by how much the film was deeper, and in x than in y
+STILL_UM = 1e-3  # of a film that does not move
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 
 
 @dataclass(frozen=True)
+class Elsewhere:
+    """What is known, besides the fringes, of the same film seen with the screen put elsewhere."""
+
+    shift_mm: tuple[float, float, float]  # of the screen along s_x, s_y and towards the mirror
+    shift_sigma_mm: float  # of its length
+    turn_sigma_deg: float  # of its direction, and of the screen's turns
+    deeper_um: float  # by how much the film was deeper then, by the laser
+    motion_um: float  # in the x frames than in the y frames
+    motion_sigma_um: float
+
+    def known(self, laser_sigma_um: float) -> FloatArray:
+        """Values and sigmas (2, MOVED), in mm and degrees: the move, the film deeper, deeper in x than in y."""
+        deeper_mm = 1e-3 * np.array([self.deeper_um, self.motion_um])
+        told = np.concatenate([self.shift_mm, np.zeros(3), deeper_mm])
+        film_mm = 1e-3 * np.array([np.sqrt(2) * laser_sigma_um, max(self.motion_sigma_um, STILL_UM)])
+        # a rail is as parallel to the screen's normal as the screen is to itself after the move
+        across_mm = np.sqrt(np.sum(np.square(self.shift_mm)) - np.square(self.shift_mm)) * np.radians(
+            self.turn_sigma_deg
+        )
+        shift_mm = np.hypot(self.shift_sigma_mm, across_mm)
+        return np.stack([told, np.concatenate([shift_mm, np.full(3, self.turn_sigma_deg), film_mm])])
+
+
+# of the screen seen directly: nothing is known of its place
+ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class SetPhases:
-    """One capture set as screen points of bins."""
+    """One capture set as screen points of bins, and those of the same film with the screen put elsewhere."""
 
     name: str
     column_px: FloatArray  # (n,): centres of the bins
@@ -89,7 +87,13 @@ class SetPhases:
     motion_um: float = 0.0
     motion_sigma_um: float = 0.0
     moved_um: float = 0.0  # RMS motion of the film during the set; that from frame to frame of an axis is corrected
-    artefact: Artefact | None = None  # what stands in the mirror's place; None: the film
+    artefact: Artefact | SeenScreen | None = None  # what is seen instead of the film
+    elsewhere: tuple[Elsewhere, ...] = ()
+    screen: IntArray | None = None  # (n,): with which of them a point was seen, from 1; 0, or None, in its place
+
+    def seen_with(self, screen: int) -> BoolArray:
+        """Which points (n,) were seen with the screen in that place."""
+        return np.full(self.sigma_mm.size, True) if self.screen is None else self.screen == screen
 
     def thinned(self, most: int) -> "SetPhases":
         """Every k-th bin, so that at most `most` are left."""
@@ -103,6 +107,7 @@ class SetPhases:
             row_px=self.row_px[keep],
             screen_mm=self.screen_mm[:, keep],
             sigma_mm=self.sigma_mm[keep],
+            screen=None if self.screen is None else self.screen[keep],
         )
 
 
@@ -112,7 +117,7 @@ class Chunk:
 
     place: slice  # which points
     residual_mm: FloatArray  # (2, m): seen minus predicted
-    # (2, COLUMNS, m), of the prediction by: the set's own unknowns, mm; the optical parameters
+    # (2, COLUMNS + further poses, m), of the prediction by: the set's own unknowns, mm; the optical parameters
     derivatives: FloatArray
 
 
@@ -130,11 +135,40 @@ def place_rays(bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex
     return points
 
 
-def residual_mm(bench: BenchGeometry, phases: SetPhases, surface: Surface, vertex_z_mm: float) -> FloatArray:
-    """Seen minus predicted screen points (2, n)."""
-    points = place_rays(bench, phases, surface, vertex_z_mm)
-    parts = [_meet(bench, points, surface, part).screen_mm for part in _parts(points.t_mm.size)]
-    return phases.screen_mm - np.concatenate(parts, axis=1) / bench.pitch
+def residual_mm(
+    bench: BenchGeometry,
+    phases: SetPhases,
+    surface: Surface,
+    vertex_z_mm: float,
+    elsewhere: Sequence[FloatArray] = (),
+) -> FloatArray:
+    """Seen minus predicted screen points (2, n); `elsewhere` are the moves (MOVED,) of the screen."""
+    out = np.empty_like(phases.screen_mm)
+    for _, there, _, some in views(bench, [], phases, elsewhere):
+        part = phases.subset(some)
+        shape = None if isinstance(phases.artefact, SeenScreen) else surface
+        points = place_rays(there, part, surface, vertex_z_mm)
+        met = [_meet(there, points, shape, part).screen_mm for part in _parts(points.t_mm.size)]
+        out[:, some] = part.screen_mm - np.concatenate(met, axis=1) / bench.pitch
+    return out
+
+
+def views(
+    bench: BenchGeometry, turns: list[Poses], phases: SetPhases, moves: Sequence[FloatArray]
+) -> Iterator[tuple[int, BenchGeometry, list[Poses], BoolArray]]:
+    """Each place of the screen: its number, the bench and its `turns` there, and which points (n,) were seen so."""
+    if isinstance(phases.artefact, SeenScreen):
+        # it stands somewhere before the camera: the bench's poses do not matter
+        camera, (s_x, s_y, _) = bench.geometry, phases.artefact.axes @ bench.geometry.rotation
+        origin_mm = camera.pinhole_mm + camera.rotation.T @ phases.artefact.origin_mm
+        there = replace(camera, screen_origin_mm=origin_mm, screen_s_x=s_x, screen_s_y=s_y)
+        still = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
+        moved = screen_elsewhere(replace(bench, geometry=there), [still] * len(turns), moves[0][:SCREEN_MOVE])
+        yield 1, *moved, phases.seen_with(0)
+        return
+    yield 0, bench, turns, phases.seen_with(0)
+    for k, move in enumerate(moves, start=1):
+        yield k, *screen_elsewhere(bench, turns, move[:SCREEN_MOVE]), phases.seen_with(k)
 
 
 def chunks(
@@ -144,15 +178,18 @@ def chunks(
     surface: Surface,
     vertex_z_mm: float,
     motion_mm: float = 0.0,
+    deeper_mm: float = 0.0,
 ) -> Iterator[Chunk]:
-    """Residuals with derivatives, some points at a time. `turns` are the `pose_derivatives` there."""
+    """Residuals with derivatives, some points at a time. `turns`: the `pose_derivatives`, and any further."""
     points = place_rays(bench, phases, surface, vertex_z_mm)
+    shape = None if isinstance(phases.artefact, SeenScreen) else surface
     for part in _parts(points.t_mm.size):
-        meet = _meet(bench, points, surface, part)
+        meet = _meet(bench, points, shape, part)
         lens = lens_derivatives(bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray)
-        derivatives = _derivatives(bench, turns, surface, meet, lens)
-        # it is small enough to be linear
-        predicted = meet.screen_mm / bench.pitch + motion_mm * derivatives[:, MOTION]
+        derivatives = _derivatives(bench, turns, shape, meet, lens)
+        # both are small enough to be linear
+        by_motion = derivatives[:, MOTION]
+        predicted = meet.screen_mm / bench.pitch + motion_mm * by_motion + deeper_mm * deeper(by_motion)
         yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
 
 
@@ -175,13 +212,15 @@ class _Meeting:
     screen_mm: FloatArray
 
 
-def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -> _Meeting:
+def _meet(bench: BenchGeometry, points: Points, surface: Surface | None, part: slice) -> _Meeting:
     """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is one."""
-    geometry, d, t = bench.geometry, points.rays[:, part], points.t_mm[part]
-    place = geometry.pinhole_mm[:, None] + t * d
-    hx, hy = slopes(surface, place[0], place[1])
-    n = np.stack([-hx, -hy, np.ones_like(hx)])
-    u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+    geometry, d = bench.geometry, points.rays[:, part]
+    t = np.zeros(d.shape[1]) if surface is None else points.t_mm[part]
+    place, n, u = geometry.pinhole_mm[:, None] + t * d, d, d
+    if surface is not None:
+        hx, hy = surface.slopes(place[0], place[1])
+        n = np.stack([-hx, -hy, np.ones_like(hx)])
+        u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
     axes = geometry.screen_axes
     start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
     k = -start[2] / along[2]
@@ -196,25 +235,48 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface, part: slice) -
 
 
 def _derivatives(
-    bench: BenchGeometry, turns: list[Poses], surface: Surface, m: _Meeting, lens: FloatArray
+    bench: BenchGeometry, turns: list[Poses], surface: Surface | None, m: _Meeting, lens: FloatArray
 ) -> FloatArray:
-    """(2, COLUMNS, m) by the formulas above, right to left: the effect on s of a change of P, u, n, d."""
-    geometry, d, n, u, k = bench.geometry, m.ray, m.normal, m.leaves, m.reach_mm
-    axes = geometry.screen_axes
-    across, onto = axes[:2] @ u, np.sum(m.face * u, axis=0)  # E u, N u
+    """(2, COLUMNS + further poses, m) by the formulas above, right to left: the effect of a change of P, u, n, d."""
+    geometry, axes = bench.geometry, bench.geometry.screen_axes
+    across, onto = axes[:2] @ m.leaves, np.sum(m.face * m.leaves, axis=0)  # E u, N u
     by_point = axes[:2, :, None] - across[:, None] * (m.face / onto)  # T
+    out = np.zeros((2, COLUMNS + len(turns) - len(POSE), m.t_mm.size))
+    by_pinhole, by_ray = by_point, by_point * m.reach_mm
+    if surface is not None:
+        by_pinhole, by_ray = _by_surface(surface, m, by_point, out)
+    in_camera = geometry.rotation @ m.ray
+    for j, turn in enumerate(turns):
+        moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
+        of_ray = turn.camera.T @ in_camera
+        column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
+        column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
+        out[:, LOCAL + j if j < len(POSE) else COLUMNS + j - len(POSE)] = column
+    first = LOCAL + len(POSE)
+    out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
+    square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
+    out[:, COLUMNS - 2] = across * square / onto / BOW_RADIUS_MM**2
+    out /= bench.pitch
+    out[:, COLUMNS - 1] = -m.screen_mm / bench.pitch**2
+    return out
+
+
+def _by_surface(
+    surface: Surface, m: _Meeting, by_point: FloatArray, out: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Fill in the surface's own columns; returns the effect of a change of the pinhole and of the ray, (2, 3, m)."""
+    d, n, k = m.ray, m.normal, m.reach_mm
     nn, nd = np.sum(n * n, axis=0), np.sum(n * d, axis=0)
     ray = by_point * k  # T k, of u
     along = np.einsum("acm,cm->am", ray, n)
     by_normal = -2 / nn * (along[:, None] * d + nd * ray - 2 * nd / nn * along[:, None] * n)
-    hxx, hxy, hyy = curvatures(surface, m.place[0], m.place[1])
+    hxx, hxy, hyy = surface.curvatures(m.place[0], m.place[1])
     by_place = by_point.copy()
     by_place[:, 0] -= by_normal[:, 0] * hxx + by_normal[:, 1] * hxy
     by_place[:, 1] -= by_normal[:, 0] * hxy + by_normal[:, 1] * hyy
     by_height = np.einsum("acm,cm->am", by_place, d) / nd
     by_pinhole = by_place - by_height[:, None] * n  # by_place G
     by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
-    out = np.empty((2, COLUMNS, d.shape[1]))
     x, y, scale = m.place[0] / surface.radius_mm, m.place[1] / surface.radius_mm, 1 / surface.radius_mm
     height, height_x, height_y = (np.vstack(parts) for parts in zip(basis(x, y), round_basis(x, y), strict=True))
     for axis in range(2):
@@ -224,53 +286,18 @@ def _derivatives(
     out[:, PARAMETERS] = by_height
     deeper = np.einsum("j,ajm->am", _deeper(), out[:, :PARAMETERS]) - by_height
     out[0, MOTION], out[1, MOTION] = deeper[0] / 2, -deeper[1] / 2
-    in_camera = geometry.rotation @ d
-    for j, turn in enumerate(turns):
-        moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
-        of_ray = turn.camera.T @ in_camera
-        column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
-        column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
-        out[:, LOCAL + j] = column
-    first = LOCAL + len(POSE)
-    out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
-    square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
-    out[:, -2] = across * square / onto / BOW_RADIUS_MM**2
-    out /= bench.pitch
-    out[:, -1] = -m.screen_mm / bench.pitch**2
-    return out
+    return by_pinhole, by_ray
+
+
+def deeper(by_motion: FloatArray) -> FloatArray:
+    """Change (2, m) of the screen points by 1 mm of depth in all frames, from that by 1 mm from x to y."""
+    return np.asarray(by_motion * np.array([[2.0], [-2.0]]))
 
 
 @cache
 def _deeper() -> FloatArray:
     """Change (36,) of the surface's parameters by 1 mm of sag; the vertex goes down by as much."""
     return Surface.hencky_bowl(1.0, 1.0).parameters
-
-
-def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray) -> FloatArray:
-    """d ray / d (relative focal length, principal point, k1, k2, p1, p2), (7, 3, m).
-
-    A pixel fixes the distorted point q = ((c, r) - principal) / focal = f(p; k): dp = (df/dp)^-1 (dq - df/dk dk), and
-    the unit vector c of (p, 1) turns by (1 - c c^T) (dp, 0) / |(p, 1)|. Coefficients beyond the first four, if the
-    stated lens has any, count as constants of df/dp only to first order: they are left out there.
-    """
-    c = geometry.rotation @ rays
-    x, y = c[0] / c[2], c[1] / c[2]
-    k1, k2, p1, p2 = (*geometry.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
-    r2 = x * x + y * y
-    radial, grows = 1 + k1 * r2 + k2 * r2**2, 2 * (k1 + 2 * k2 * r2)
-    fxx = radial + grows * x * x + 2 * p1 * y + 6 * p2 * x
-    fxy = grows * x * y + 2 * p1 * x + 2 * p2 * y
-    fyy = radial + grows * y * y + 6 * p1 * y + 2 * p2 * x
-    qx = (column_px - geometry.principal_px[0]) / geometry.focal_px
-    qy = (row_px - geometry.principal_px[1]) / geometry.focal_px
-    zero, step = np.zeros_like(x), np.full_like(x, -1 / geometry.focal_px)
-    of_x = np.stack([-qx, step, zero, -x * r2, -x * r2**2, -2 * x * y, -(r2 + 2 * x * x)])
-    of_y = np.stack([-qy, zero, step, -y * r2, -y * r2**2, -(r2 + 2 * y * y), -2 * x * y])
-    det = fxx * fyy - fxy**2
-    px, py = (fyy * of_x - fxy * of_y) / det, (fxx * of_y - fxy * of_x) / det
-    moved = np.stack([px, py, np.zeros_like(px)], axis=1) * c[2]
-    turned = moved - np.sum(moved * c, axis=1, keepdims=True) * c
-    return np.asarray(np.einsum("ij,lim->ljm", geometry.rotation, turned))
 
 
 def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -280,8 +307,8 @@ def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     bowl = series.polyval(v, excess) - excess[0]
     grows = 2 * series.polyval(v, series.polyder(excess))
     powers, tables = _monomials(x, y), _tables()
-    heights = multiply(tables[0], powers) - zernike.at_vertex()[1:, None]
-    slopes_x, slopes_y = multiply(tables[1], powers), multiply(tables[2], powers)
+    heights = compiled.multiply(tables[0], powers) - zernike.at_vertex()[1:, None]
+    slopes_x, slopes_y = compiled.multiply(tables[1], powers), compiled.multiply(tables[2], powers)
     return np.vstack([heights, bowl]), np.vstack([slopes_x, grows * x]), np.vstack([slopes_y, grows * y])
 
 
@@ -312,24 +339,3 @@ def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
     table = zernike.monomial_table()
     height, of_x, of_y = (t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2))))
     return np.ascontiguousarray(height), np.ascontiguousarray(of_x), np.ascontiguousarray(of_y)
-
-
-def slopes(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """dh/dx and dh/dy."""
-    x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
-    grows = 2 * series.polyval(x * x + y * y, series.polyder(surface.excess))
-    of_x, of_y = (series.polyval2d(x, y, series.polyder(surface.polynomial, axis=axis)) for axis in (0, 1))
-    return (of_x + grows * x) / surface.radius_mm, (of_y + grows * y) / surface.radius_mm
-
-
-def curvatures(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """h_xx, h_xy and h_yy in 1/mm."""
-    x, y = x_mm / surface.radius_mm, y_mm / surface.radius_mm
-    v = x * x + y * y
-    first = 2 * series.polyval(v, series.polyder(surface.excess))
-    second = 4 * series.polyval(v, series.polyder(surface.excess, 2))
-    by_x, by_y = (series.polyder(surface.polynomial, axis=axis) for axis in (0, 1))
-    hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
-    hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
-    hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
-    return hxx / surface.radius_mm**2, hxy / surface.radius_mm**2, hyy / surface.radius_mm**2

@@ -10,7 +10,7 @@ the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has
 vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -19,7 +19,8 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics import film_law
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, Surface
+from membrane_ctrl.metrology.optics.compiled import gram
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface, beyond_of
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -30,7 +31,6 @@ COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 # the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
-_STILL_UM = 1e-3  # of a film that does not move
 _TILT_STEP = 1e-4
 _PATCHES = 12  # across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
 _FEW_IN_PATCH = 4
@@ -45,6 +45,7 @@ class SetState:
     surface: Surface
     vertex_z_mm: float  # height of its vertex
     motion_mm: float = 0.0  # by how much the film was deeper in the x frames than in the y frames
+    elsewhere: tuple[FloatArray, ...] = ()  # (MOVED,) of each screen elsewhere
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,8 @@ class Equations:
     residual_mm: FloatArray  # (2, n): seen minus predicted screen points
     trust: Trust  # the points' weights
     residual_rms_mm: float  # RMS of one component, each point counting by its weight
+    # of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first, which `sums` eliminates
+    elsewhere: tuple[FloatArray, ...] = ()
 
     @property
     def variance(self) -> float:
@@ -144,13 +147,23 @@ class Equations:
         own, mixed = self.sums[: residuals.LOCAL, : residuals.LOCAL], self.sums[: residuals.LOCAL, residuals.LOCAL :]
         return np.asarray(np.linalg.solve(own, mixed[:, -1] - mixed[:, :-1] @ common_step))
 
+    def moved(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
+        """Steps (MOVED,) of the screens elsewhere that go with those."""
+        step, own = np.append(local_step, common_step), slice(residuals.MOVED)
+        right = [sums[own, -1] - sums[own, residuals.MOVED : -1] @ step for sums in self.elsewhere]
+        pairs = zip(self.elsewhere, right, strict=True)
+        return [np.asarray(np.linalg.solve(sums[own, own], each)) for sums, each in pairs]
+
     def reduced(self) -> FloatArray:
         """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
-        mixed = self.sums[: residuals.LOCAL, residuals.LOCAL :]
-        left = self.sums[residuals.LOCAL :, residuals.LOCAL :] - mixed.T @ np.linalg.solve(
-            self.sums[: residuals.LOCAL, : residuals.LOCAL], mixed
-        )
-        return np.asarray((left + left.T) / 2)
+        return without(self.sums, residuals.LOCAL)
+
+
+def without(sums: FloatArray, first: int) -> FloatArray:
+    """Schur complement over the first unknowns."""
+    mixed = sums[:first, first:]
+    left = sums[first:, first:] - mixed.T @ np.linalg.solve(sums[:first, :first], mixed)
+    return np.asarray((left + left.T) / 2)
 
 
 def equations(
@@ -163,18 +176,44 @@ def equations(
     trust: Trust,
 ) -> Equations:
     """Linearise one set; `common` (COMMON,) are parameters and ring."""
-    sums = np.zeros((residuals.LOCAL + COMMON + 1,) * 2)
-    keep = np.append(np.arange(residuals.COLUMNS), residuals.LOCAL + COMMON)
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
-    residual = np.empty_like(phases.screen_mm)
-    for part in residuals.chunks(bench, turns, phases, state.surface, state.vertex_z_mm, state.motion_mm):
-        residual[:, part.place] = part.residual_mm
-        for derivatives, left in zip(part.derivatives, part.residual_mm, strict=True):
-            sums[np.ix_(keep, keep)] += residuals.gram(np.vstack([derivatives, left]) * root[part.place])
+    residual, elsewhere = np.empty_like(phases.screen_mm), []
     rows = _reference_rows(phases, state, common, references)
+    sums = rows.T @ rows
+    for k, there, poses, some in residuals.views(bench, turns, phases, state.elsewhere):
+        move = state.elsewhere[k - 1] if k else np.array([0.0, state.motion_mm])
+        seen, film_mm = phases.subset(some), (move[-1], move[-2])
+        parts = residuals.chunks(there, poses, seen, state.surface, state.vertex_z_mm, *film_mm)
+        found, residual[:, some] = _fringes(parts, root[some], k > 0)
+        if k:
+            told, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
+            hand = np.hstack([np.eye(residuals.MOVED), (told - move)[:, None]]) / sigmas[:, None]
+            own = np.append(np.arange(residuals.MOVED), len(found) - 1)
+            found[np.ix_(own, own)] += hand.T @ hand
+            elsewhere.append(found)
+            found = without(found, residuals.MOVED)
+        sums = sums + found
     weights = trust.weights / phases.sigma_mm**2
     rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
-    return Equations(sums + rows.T @ rows, residual, trust, rms)
+    return Equations(sums, residual, trust, rms, tuple(elsewhere))
+
+
+def _fringes(parts: Iterable[residuals.Chunk], root: FloatArray, moved: bool) -> tuple[FloatArray, FloatArray]:
+    """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2, n)."""
+    first = residuals.MOVED if moved else 0
+    sums, left = np.zeros((first + residuals.LOCAL + COMMON + 1,) * 2), np.empty((2, root.size))
+    keep = np.append(np.arange(first + residuals.COLUMNS), len(sums) - 1)
+    for part in parts:
+        left[:, part.place] = part.residual_mm
+        derivatives = part.derivatives
+        if moved:
+            motion = derivatives[:, residuals.MOTION].copy()
+            derivatives[:, residuals.MOTION] = 0.0  # its own
+            columns = [derivatives[:, residuals.COLUMNS :], residuals.deeper(motion)[:, None], motion[:, None]]
+            derivatives = np.concatenate([*columns, derivatives[:, : residuals.COLUMNS]], axis=1)
+        for rows, miss in zip(derivatives, part.residual_mm, strict=True):
+            sums[np.ix_(keep, keep)] += gram(np.vstack([rows, miss]) * root[part.place])
+    return sums, left
 
 
 def _reference_rows(
@@ -184,11 +223,13 @@ def _reference_rows(
 
     Of a film: ring, laser, motion and law. Of an artefact: its form.
     """
+    if isinstance(phases.artefact, SeenScreen):
+        return np.eye(residuals.LOCAL, residuals.LOCAL + COMMON + 1)  # there is no surface
     if phases.artefact is not None:
         return _artefact_rows(phases.artefact, state)
     rows = np.zeros((RING + 2, residuals.LOCAL + COMMON + 1))
     rows[-1, residuals.MOTION], rows[-1, -1] = 1.0, 1e-3 * phases.motion_um - state.motion_mm
-    rows[-1] /= max(phases.motion_sigma_um, _STILL_UM) * 1e-3
+    rows[-1] /= max(phases.motion_sigma_um, residuals.STILL_UM) * 1e-3
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
@@ -219,33 +260,6 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
     return rows / (_FREE_MM if film == "free" else _LAW_MM)
 
 
-@cache
-def _family() -> tuple[FloatArray, FloatArray]:
-    """Legendre degree 4 (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
-    rows = []
-    for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
-        bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), film_law.POISSON_RATIO, 1.0)
-        coef = film_law.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
-        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (4, *film_law.BEYOND)])
-    table = np.array(rows)
-    return table[:, 0], table[:, 1:]
-
-
-def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
-    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at this sag.
-
-    At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
-    """
-    own = (
-        film_law.profile_legendre().coef[[4, *film_law.BEYOND]]
-        / np.sqrt(2 * np.array([4, *film_law.BEYOND]) + 1)
-        / film_law.excess_rms()
-    )
-    fourth, others = _family()
-    there = [np.interp(excess_mm * own[0] / sag_mm, fourth, other) for other in others.T]
-    return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
-
-
 def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     """Form and place of an artefact as weighted rows; its tilt, the first two terms, is not known."""
     terms = [*range(PARAMETERS), *range(residuals.BEYOND.start, residuals.BEYOND.stop)]
@@ -262,7 +276,7 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
         form[:, :PARAMETERS] -= np.outer((artefact.terms_mm(*(tilt + step)) - here)[2:] / _TILT_STEP, lean)
     form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
     vertex[[PARAMETERS, -1]] = np.array([1.0, artefact.vertex_mm - state.vertex_z_mm]) / artefact.vertex_sigma_mm
-    still[residuals.MOTION] = 1.0 / (1e-3 * _STILL_UM)
+    still[residuals.MOTION] = 1.0 / (1e-3 * residuals.STILL_UM)
     return rows
 
 
@@ -300,18 +314,23 @@ def averaged(
     bench: parameters.BenchGeometry, phases: residuals.SetPhases, state: SetState, about: int
 ) -> residuals.SetPhases:
     """The set reduced to about that many points; robust, each with the noise of its mean."""
-    left = residuals.residual_mm(bench, phases, state.surface, state.vertex_z_mm)
+    shape = state.surface, state.vertex_z_mm, state.elsewhere
+    left = residuals.residual_mm(bench, phases, *shape)
     weights = Trust.seen(phases, left).weights / phases.sigma_mm**2
     width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)
     cell_px = max(float(np.sqrt(width * height * np.pi / 4 / about)), 1.0)  # the mirror is seen as an ellipse
     column, row = (np.floor(place / cell_px).astype(int) for place in (phases.column_px, phases.row_px))
-    _, cell = np.unique(column + (row.max() + 1 - row) * (column.max() + 1), return_inverse=True)
+    screen = np.zeros(row.size, int) if phases.screen is None else phases.screen
+    place = column + (row.max() + 1 - row + (row.max() + 2) * screen) * (column.max() + 1)
+    _, first, cell = np.unique(place, return_index=True, return_inverse=True)
     total = np.bincount(cell, weights)
     column_px, row_px, *rest = (
         np.bincount(cell, weights * value) / total for value in (phases.column_px, phases.row_px, *left)
     )
     sigma_mm = 1 / np.sqrt(total)
     dark = np.zeros((2, total.size))
-    bare = replace(phases, column_px=column_px, row_px=row_px, screen_mm=dark, sigma_mm=sigma_mm)
-    model = -residuals.residual_mm(bench, bare, state.surface, state.vertex_z_mm)
+    bare = replace(
+        phases, column_px=column_px, row_px=row_px, screen_mm=dark, sigma_mm=sigma_mm, screen=screen[first]
+    )
+    model = -residuals.residual_mm(bench, bare, *shape)
     return replace(bare, screen_mm=model + np.stack(rest))

@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
@@ -49,6 +49,11 @@ class Problem:
     def films(self) -> list[int]:
         """Which sets show the film; the others show artefacts."""
         return [k for k, phases in enumerate(self.sets) if phases.artefact is None]
+
+    @property
+    def with_artefact(self) -> bool:
+        """Whether a known surface stood in the mirror's place."""
+        return any(isinstance(each.artefact, Artefact) for each in self.sets)
 
     @property
     def middle(self) -> int:
@@ -200,7 +205,9 @@ def _moved(state: separable.SetState, linear: separable.Equations, common_step: 
     beyond_mm = np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[residuals.BEYOND]
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
     vertex_z_mm, motion_mm = state.vertex_z_mm + own[PARAMETERS], state.motion_mm + own[residuals.MOTION]
-    return separable.SetState(surface, float(vertex_z_mm), float(motion_mm))
+    steps = linear.moved(own, common_step)
+    elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
+    return separable.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
 
 
 def first_states(problem: Problem) -> tuple[separable.SetState, ...]:
@@ -212,22 +219,20 @@ def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
     moved_um, artefact = phases.displacement_um - problem.references.reference_um, phases.artefact
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     radius_mm = problem.radius_mm
+    elsewhere = tuple(each.known(problem.references.laser_sigma_um)[0] for each in phases.elsewhere)
+    if isinstance(artefact, SeenScreen):
+        return separable.SetState(Surface.from_parameters(np.zeros(PARAMETERS), radius_mm), 0.0, elsewhere=elsewhere)
     if artefact is not None:
         vertex_z_mm, radius_mm = artefact.vertex_mm, artefact.radius_mm
     fit = fit_on(parameters.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
-    return separable.SetState(fit.surface, vertex_z_mm)
-
-
-def slope_residual(solution: Solution, phases: residuals.SetPhases, index: int) -> float:
-    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
-    fit = fit_on(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
-    return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))
+    return separable.SetState(fit.surface, vertex_z_mm, elsewhere=elsewhere)
 
 
 def fit_on(
     bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
 ) -> reconstruct.Fit:
     """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
+    phases = phases.subset(phases.seen_with(0))
     tracer = reconstruct.Tracer(bench.geometry, radius_mm, vertex_z_mm)
     points = reconstruct.Points.of(residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
     return reconstruct.solve(tracer, points, reconstruct.parabola(_START_SAG_MM, radius_mm))
@@ -342,5 +347,4 @@ def _turn_vector(cross: FloatArray) -> FloatArray:
 
 
 def _vector(values: FloatArray) -> Vector3:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    return float(values[0]), float(values[1]), float(values[2])

@@ -41,7 +41,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     spread_um = float(np.ptp(moved[known])) if known.any() else 0.0
     seen_um = float(np.ptp(sag_um))
     if max(spread_um, seen_um) < LEAST_SPREAD_UM:
-        if len(problem.films) < len(problem.sets):
+        if problem.with_artefact:
             return ()  # the artefacts add what the film does not
         says = (
             f"the sets are only {max(spread_um, seen_um):.0f} um apart: they add nothing to one of them; "
@@ -68,9 +68,19 @@ def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     film = _film(solution)
     if not solution.converged:
         return (film[0][1] if film else _astray(solution),)
-    causes = [*film, *_sets(solution), *_laser(solution), *_model(solution)]
+    causes = [*film, *_elsewhere(solution), *_sets(solution), *_laser(solution), *_model(solution)]
     cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
     return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
+
+
+def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """A screen that stood elsewhere than a set states, with the share that it explains."""
+    says = "the screen was not where screen_moved says beside {}: correct shift_mm, or its sigmas"
+    names = [phases.name for phases in solution.problem.sets]
+    return [
+        (fall - 2 * parameters.SCREEN_MOVE, CalibrationFinding(True, says.format(names[k]), (k,)))
+        for k, fall in diagnose.elsewhere(solution)
+    ]
 
 
 def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
@@ -119,7 +129,12 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A bumped camera, a bad set, sets that do not belong together, each with the share that it explains."""
     names = [phases.name for phases in solution.problem.sets]
     out = [
-        (np.inf, CalibrationFinding(True, f"{names[k]} disagrees with all the others: it is of another bench", (k,)))
+        (
+            np.inf,
+            CalibrationFinding(
+                True, f"{names[k]} disagrees with all the others: {_doubt(solution.problem, k)}", (k,)
+            ),
+        )
         for k in _of_others(solution)[:1]
     ]
     for bump in diagnose.bumps(solution)[:1]:
@@ -148,6 +163,11 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     return out
 
 
+def _doubt(problem: Problem, index: int) -> str:
+    artefact = problem.sets[index].artefact
+    return "it is of another bench" if artefact is None else artefact.doubt
+
+
 def _of_others(solution: Solution) -> list[int]:
     """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by noise."""
     ratios = np.array([(np.sqrt(each.variance), each.trust.alike) for each in solution.equations])
@@ -159,7 +179,7 @@ def _astray(solution: Solution) -> CalibrationFinding:
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
         if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
-            says = f"{problem.sets[k].name} disagrees with all the others: it is of another bench"
+            says = f"{problem.sets[k].name} disagrees with all the others: {_doubt(problem, k)}"
             return CalibrationFinding(True, says, (k,))
     for k in range(2, count - 1):
         if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
@@ -183,7 +203,7 @@ def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
     rest, phases = diagnose.without(solution, index), solution.problem.sets[index]
     if phases.artefact is not None:
-        return f"it is not the {phases.artefact.name} that its file states, or it stood elsewhere"
+        return phases.artefact.doubt
     rim_mm = separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (rest.common[len(parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
@@ -229,7 +249,7 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What other sets would have determined."""
     problem = solution.problem
     moved = np.array([problem.sets[k].displacement_um for k in problem.films])
-    if len(problem.films) < len(problem.sets):
+    if problem.with_artefact:
         return ()  # the sag rests on the artefacts
     if np.count_nonzero(np.isfinite(moved)) < 2:
         says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"

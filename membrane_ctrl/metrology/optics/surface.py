@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.optics import film_law, zernike
 from membrane_ctrl.model.arrays import FloatArray
@@ -60,17 +61,36 @@ class Surface:
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height in mm at points (...) in mm."""
         x, y = np.asarray(x_mm) / self.radius_mm, np.asarray(y_mm) / self.radius_mm
-        bowl = np.polynomial.polynomial.polyval2d(x, y, self.polynomial)
-        return np.asarray(bowl + np.polynomial.polynomial.polyval(x * x + y * y, self.excess))
+        bowl = series.polyval2d(x, y, self.polynomial)
+        return np.asarray(bowl + series.polyval(x * x + y * y, self.excess))
+
+    def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """dh/dx and dh/dy."""
+        x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
+        grows = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
+        of_x, of_y = (series.polyval2d(x, y, series.polyder(self.polynomial, axis=axis)) for axis in (0, 1))
+        return (of_x + grows * x) / self.radius_mm, (of_y + grows * y) / self.radius_mm
+
+    def curvatures(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """h_xx, h_xy and h_yy in 1/mm."""
+        x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
+        v = x * x + y * y
+        first = 2 * series.polyval(v, series.polyder(self.excess))
+        second = 4 * series.polyval(v, series.polyder(self.excess, 2))
+        by_x, by_y = (series.polyder(self.polynomial, axis=axis) for axis in (0, 1))
+        hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
+        hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
+        hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
+        return hxx / self.radius_mm**2, hxy / self.radius_mm**2, hyy / self.radius_mm**2
 
     def on_grid(self, axis_mm: FloatArray) -> FloatArray:
         """Height in mm and its slopes along x and y, (3, n, n), on a square grid; rows along y."""
         axis, bowl = axis_mm / self.radius_mm, self.polynomial.T
         v = axis**2 + axis[:, None] ** 2
-        steeper = 2 * np.polynomial.polynomial.polyval(v, np.polynomial.polynomial.polyder(self.excess))
-        terms = [bowl, *(np.polynomial.polynomial.polyder(bowl, axis=k) for k in (1, 0))]
-        out = np.stack([np.polynomial.polynomial.polygrid2d(axis, axis, term) for term in terms])
-        out += np.stack([np.polynomial.polynomial.polyval(v, self.excess), steeper * axis, steeper * axis[:, None]])
+        steeper = 2 * series.polyval(v, series.polyder(self.excess))
+        terms = [bowl, *(series.polyder(bowl, axis=k) for k in (1, 0))]
+        out = np.stack([series.polygrid2d(axis, axis, term) for term in terms])
+        out += np.stack([series.polyval(v, self.excess), steeper * axis, steeper * axis[:, None]])
         out[1:] /= self.radius_mm
         return np.asarray(out)
 
@@ -105,7 +125,7 @@ def height_probe() -> FloatArray:
     k = np.arange(512)
     rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = np.polynomial.polynomial.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
+    excess = series.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
     terms = np.vstack([zernike.values(x, y), excess])
     return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
 
@@ -116,10 +136,37 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
     k = np.arange(1024)
     rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = np.polynomial.polynomial.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
+    excess = series.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
     own = zernike.values(x, y).T @ parameter_to_coeffs() + np.outer(excess, np.eye(PARAMETERS)[-1])
-    beyond = np.polynomial.polynomial.polyval(rho**2, film_law.beyond().T).T
+    beyond = series.polyval(rho**2, film_law.beyond().T).T
     return x, y, np.linalg.pinv(np.hstack([own, beyond]))
+
+
+@cache
+def _family() -> tuple[FloatArray, FloatArray]:
+    """Legendre degree 4 (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
+    rows = []
+    for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
+        bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), film_law.POISSON_RATIO, 1.0)
+        coef = film_law.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
+        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (4, *film_law.BEYOND)])
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:]
+
+
+def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
+    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at this sag.
+
+    At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
+    """
+    own = (
+        film_law.profile_legendre().coef[[4, *film_law.BEYOND]]
+        / np.sqrt(2 * np.array([4, *film_law.BEYOND]) + 1)
+        / film_law.excess_rms()
+    )
+    fourth, others = _family()
+    there = [np.interp(excess_mm * own[0] / sag_mm, fourth, other) for other in others.T]
+    return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
 
 
 @dataclass(frozen=True)
@@ -137,6 +184,11 @@ class Artefact:
     def name(self) -> str:
         """For a person."""
         return "sphere" if self.curvature_per_mm else "flat"
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong if it disagrees with the other sets."""
+        return f"it is not the {self.name} that its file states, or it stood elsewhere"
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
         """Parameters (36,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
@@ -159,6 +211,16 @@ class Artefact:
         across = 1 / math.sqrt(1 + tilt_x**2 + tilt_y**2)
         q = curvature * (x * x + y * y) + 2 * across * (tilt_x * x + tilt_y * y)
         return np.asarray(q / (across + np.sqrt(across**2 - curvature * q)))
+
+
+@dataclass(frozen=True)
+class SeenScreen:
+    """The screen itself, seen without the mirror, anywhere: it shows lens and bow."""
+
+    origin_mm: FloatArray  # (3,): O' in the camera's frame, about
+    axes: FloatArray  # (3, 3): rows s_x, s_y and normal there
+    name = "screen"
+    doubt = "it shows another lens, or another screen"
 
 
 # The radial profile against Hencky's bowl, and the pressure that belongs to it.

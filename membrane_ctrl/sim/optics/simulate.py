@@ -14,6 +14,7 @@ from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
+from membrane_ctrl.sim.optics.trace import Trace, onto_face
 
 # The `capture.toml` of a simulated set, and its truth.
 _GRID = 201  # odd, so that the vertex is a point of the truth's map
@@ -39,6 +40,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "camera": camera,
         "mirror": _written(spec.optics.mirror),
         **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
+        **({"screen_moved": dict(spec.screen_moved)} if spec.screen_moved else {}),
         "frames": [_frame_row(spec, frame, float(readings_um[frame])) for frame in range(len(spec.patterns))],
     }
     return table
@@ -224,8 +226,21 @@ def _anchored(spec: SimulationSpec) -> SimulationSpec:
     return replace(spec, stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}))
 
 
+class _SeenDirectly(OpticsRenderer):
+    """The screen itself before the camera; there is no film."""
+
+    def _trace(self, directions: FloatArray, displacement_um: float, film: Any = None) -> Trace:
+        screen = self._screen_pose
+        axes = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
+        start, along = axes @ (self._camera_pose.position_mm - screen.origin_mm), directions @ axes.T
+        tangents = along[:, :2].T / along[:, 2]
+        seen_mm = onto_face(start[:2, None] - start[2] * tangents, tangents, screen.bow_per_mm, screen.height_map)
+        return Trace(np.zeros(len(along)), np.zeros(len(along)), *seen_mm)
+
+
 def _renderer(spec: SimulationSpec) -> OpticsRenderer:
-    return OpticsRenderer(
+    kind = _SeenDirectly if spec.artefact.get("form") == "screen" else OpticsRenderer
+    return kind(
         spec.optics, spec.film, spec.light, spec.reference_um, spec.screen_error, exact=spec.exact, seed=spec.seed
     )
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite, isinf, pi, sin, sqrt
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -132,6 +132,7 @@ class SimulationSpec:
     exact: bool = False
     seed: int = 1
     artefact: Mapping[str, str | float] = field(default_factory=dict)  # `[artefact]` of a set that shows one
+    screen_moved: Mapping[str, Any] = field(default_factory=dict)  # `[screen_moved]`, if the true one is elsewhere
     faults: tuple[FrameFault, ...] = ()  # faults of single frames
     # modulus times thickness, for the gauge's reading
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
