@@ -37,7 +37,7 @@ _SHARE_S = 2.0  # memory of the sensors' weights
 # Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is large
 _RUN = 14.0, 8.0
 _OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
-Rows = tuple[tuple[int, float], ...]  # states and their factors in a reading's expectation
+_ONE: FloatArray = np.eye(_PLANT + CLONES)  # a reading's expectation is a sum of states: one of them, as a row
 
 
 @dataclass(slots=True)
@@ -66,6 +66,8 @@ class CentreFilter:
         self._pressure_gain = loop.barometer_gain_um_per_pa
         self._warmth_gain = loop.temperature_gain_um_per_k
         self._gas_follows_air_s = loop.gas_follows_air_s
+        weather: FloatArray = self._pressure_gain * _ONE[_AMBIENT] + self._warmth_gain * _ONE[_WARMTH]
+        self._centre: FloatArray = _ONE[_GAS] + weather
         self._uses = (loop.feedforward_barometer, loop.feedforward_temperature)
 
     def start(
@@ -112,10 +114,7 @@ class CentreFilter:
 
     def blame_optics(self, mount_um: float) -> None:
         """The optics were wrong: what the mount has moved from there was the centre's motion. They lock anew."""
-        moved_um = self._x[_MOUNT] - mount_um
-        self._x[_MOUNT] = mount_um
-        self._x[_GAS] += moved_um
-        self._x[_PLANT:] += moved_um
+        self._x += (self._x[_MOUNT] - mount_um) * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
         self.relock()
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
@@ -131,16 +130,13 @@ class CentreFilter:
         for n, (state, value, noise) in enumerate(weather):
             if self._uses[n] and math.isfinite(value):
                 sensor = Sensor(Sensor.BAROMETER + n)
-                self._take(sensor, ((state, 1.0),), self._from_origin(n, value), noise**2, given.now_s)
+                self._take(sensor, _ONE[state], self._from_origin(n, value), noise**2, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
         if math.isfinite(given.laser_um):
-            rows = (*self._centre_rows(), (_MOUNT, 1.0))
-            self._take(Sensor.LASER, rows, given.laser_um, config.laser_noise_um**2, given.now_s)
+            row = self._centre + _ONE[_MOUNT]
+            self._take(Sensor.LASER, row, given.laser_um, config.laser_noise_um**2, given.now_s)
         return self._estimate(given.now_s)
-
-    def _centre_rows(self) -> Rows:
-        return (_GAS, 1.0), (_AMBIENT, self._pressure_gain), (_WARMTH, self._warmth_gain)
 
     def _from_origin(self, which: int, value: float) -> float:
         """The value less the first one: numbers stay small."""
@@ -172,12 +168,9 @@ class CentreFilter:
         slot = self._count // self._every % CLONES
         self._times[slot] = now_s
         slot += _PLANT
-        rows = self._centre_rows()
-        self._p[slot] = sum(share * self._p[i] for i, share in rows)
-        column = sum(share * self._p[:, i] for i, share in rows)
-        self._p[:, slot] = column
-        self._p[slot, slot] = sum(share * self._p[i, slot] for i, share in rows)
-        self._x[slot] = sum(share * self._x[i] for i, share in rows)
+        self._p[slot] = self._p[:, slot] = self._centre @ self._p
+        self._p[slot, slot] = self._centre @ self._p[slot]
+        self._x[slot] = self._centre @ self._x
 
     def _take_frame(self, given: CentreReadings) -> None:
         times, time_s = self._times, given.sag_time_s
@@ -185,12 +178,12 @@ class CentreFilter:
         early, late = int(before.argmax()), int(after.argmin())
         if not math.isfinite(before[early]) or time_s > given.now_s:
             return  # older than the memory, or from the future
-        rows: Rows = ((_PLANT + early, 1.0), (_STAND, -1.0))
+        row = _ONE[_PLANT + early] - _ONE[_STAND]
         if math.isfinite(after[late]):
             share = float((time_s - times[early]) / (times[late] - times[early]))
-            rows = ((_PLANT + early, 1.0 - share), (_PLANT + late, share), (_STAND, -1.0))
+            row += share * (_ONE[_PLANT + late] - _ONE[_PLANT + early])
         variance = given.sag_sigma_um**2 + self._config.optics_noise_um**2
-        self._take(Sensor.OPTICS, rows, self._from_origin(2, given.sag_um), variance, given.now_s, time_s)
+        self._take(Sensor.OPTICS, row, self._from_origin(2, given.sag_um), variance, given.now_s, time_s)
         if (interval_s := time_s - self._last_frame_s) > 0:
             longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - self._frame_interval_s
             self._frame_interval_s += _INTERVAL_SHARE * longer_s
@@ -212,16 +205,16 @@ class CentreFilter:
             matrix[_STAND] = 0.0
 
     def _take(
-        self, sensor: Sensor, rows: Rows, value: float, variance: float, now_s: float, taken_s: float = math.nan
+        self, sensor: Sensor, row: FloatArray, value: float, variance: float, now_s: float, taken_s: float = math.nan
     ) -> None:
-        """Use one reading, whose expectation is the sum of states times factors, by how well it fits."""
+        """Use one reading, whose expectation is a row times the states, by how well it fits."""
         taken_s = now_s if math.isnan(taken_s) else taken_s
         watch, x, p = self._watches[sensor], self._x, self._p
         variance *= self._noises[sensor].factor
-        innovation = float(value - sum(factor * x[i] for i, factor in rows))
+        innovation = float(value - row @ x)
         if abs(innovation) > _IMPOSSIBLE:
             return
-        ph, spread = self._spread(rows, variance)
+        ph, spread = self._spread(row, variance)
         squared = innovation**2 / spread
         watch.innovation = innovation / math.sqrt(spread)
         leads = sensor != Sensor.LASER or not self._fresh(Sensor.OPTICS, now_s)
@@ -237,7 +230,7 @@ class CentreFilter:
             self._widen_leak(ramp, now_s, math.sqrt(spread))
         if watch.far or runs:
             watch.far = 0
-            ph, spread = self._spread(rows, variance)
+            ph, spread = self._spread(row, variance)
         elif squared > _HUBER2:
             spread *= squared / _HUBER2
         gain = ph / spread
@@ -245,7 +238,7 @@ class CentreFilter:
         p -= gain[:, None] * ph
         watch.seen_s, watch.taken_s = now_s, taken_s
         if sensor in (Sensor.LASER, Sensor.OPTICS):
-            watch.pull += abs(float(sum(share * gain[i] for i, share in self._centre_rows())))
+            watch.pull += abs(float(self._centre @ gain))
 
     def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
         """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
@@ -270,10 +263,10 @@ class CentreFilter:
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
         return self._walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
-    def _spread(self, rows: Rows, variance: float) -> tuple[FloatArray, float]:
+    def _spread(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
         """Covariance of all states with a reading's expectation, and the variance of its innovation."""
-        ph: FloatArray = np.asarray(sum(factor * self._p[i] for i, factor in rows))
-        return ph, float(sum(factor * ph[i] for i, factor in rows)) + variance
+        ph: FloatArray = self._p @ row
+        return ph, float(row @ ph) + variance
 
     def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
         """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a single bad one.
@@ -293,41 +286,39 @@ class CentreFilter:
         """A sensor has moved and stays there: let the others say whether it moved, or what it sees."""
         since_s = self._watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
+        moved = _ONE[_GAS] + self._centre_since(since_s)
         if sensor == Sensor.THERMOMETER:
-            self._widen(_AIR, innovation, math.inf, 0.0)
+            self._widen(innovation * _ONE[_AIR])
         elif sensor == Sensor.LASER and self._judged and self._fresh(Sensor.OPTICS, now_s):
-            self._widen(_MOUNT, innovation, math.inf, 0.0)
+            self._widen(innovation * _ONE[_MOUNT])
         elif sensor == Sensor.BAROMETER:
-            self._widen(_AMBIENT, innovation, since_s, self._pressure_gain)
-            self._widen(_GAS, self._pressure_gain * innovation, since_s, 1.0)
+            self._widen(innovation * (_ONE[_AMBIENT] + self._pressure_gain * self._centre_since(since_s)))
+            self._widen(self._pressure_gain * innovation * moved)
         elif sensor == Sensor.OPTICS and self._laser_agrees(now_s) and not self._fresh(sensor, since_s):
             # they are back, and the mirror has followed the laser's mount meanwhile
-            self._widen(_GAS, innovation, -math.inf, 1.0, on_mount=-1.0)
+            self._widen(innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT]))
         else:
-            self._widen(_GAS, innovation, since_s, 1.0)
+            self._widen(innovation * moved)
             if sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s):
                 self.relock()  # optics that missed it count from where the laser sees the film
             elif sensor == Sensor.OPTICS and self._laser_agrees(now_s):
-                self._widen(_STAND, _OPTICS_JUMP_SHARE * innovation, math.inf, 0.0)
+                self._widen(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
 
     def _laser_agrees(self, now_s: float) -> bool:
         return self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far
 
-    def _widen(self, state: int, by: float, since_s: float, on_centre: float, on_mount: float = 0.0) -> None:
-        """A state, and with it the centre since a time and the laser's mount, may have jumped by some `by`."""
-        jump = np.zeros_like(self._x)
-        jump[_MOUNT] = on_mount * by
-        jump[state] = by
-        jump[_PLANT:][self._times >= since_s] = on_centre * by
+    def _centre_since(self, since_s: float) -> FloatArray:
+        return np.concatenate([np.zeros(_PLANT), self._times >= since_s])
+
+    def _widen(self, jump: FloatArray) -> None:
+        """The states may have jumped by some such amounts."""
         self._p += jump[:, None] * jump
 
     def _widen_leak(self, ramp: Ramp, now_s: float, sigma_um: float) -> None:
         """The leak may have changed when the innovations began to run away."""
-        since_s, by = ramp.since_s, ramp.slope * sigma_um
-        jump = np.zeros_like(self._x)
-        jump[_LEAK], jump[_GAS] = -by, by * (now_s - since_s)
-        jump[_PLANT:] = by * np.maximum(self._times - since_s, 0.0)
-        self._p += jump[:, None] * jump
+        jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
+        jump[_PLANT:] = np.maximum(self._times - ramp.since_s, 0.0)
+        self._widen(ramp.slope * sigma_um * jump)
 
     def _fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
@@ -336,18 +327,15 @@ class CentreFilter:
         return now_s - self._watches[sensor].seen_s <= limit_s
 
     def _estimate(self, now_s: float) -> CentreEstimate:
-        x, p, rows = self._x, self._p, self._centre_rows()
-        centre_um = sum(share * x[i] for i, share in rows)
-        ph = sum(share * p[i] for i, share in rows)
-        variance = max(0.0, sum(share * ph[i] for i, share in rows))
+        x = self._x
         drift = float(x[_LEAK])
         if self._gas_follows_air_s > 0:
             drift -= float(self._warmth_gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
-        um = float(centre_um + x[_MOUNT])
+        um = float(self._centre @ x + x[_MOUNT])
         pulls = sum(watch.pull for watch in self._watches)
         return CentreEstimate(
             um=um,
-            sigma_um=math.sqrt(variance),
+            sigma_um=math.sqrt(max(0.0, self._spread(self._centre, 0.0)[1])),
             mount_um=float(x[_MOUNT]),
             ahead_um=um + self._transit.coming_um(drift),
             due_um_per_s=self._transit.due_um_per_s() - drift,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.filters import EarlyMean, LowPass, smoothing
+from membrane_ctrl.control.filters import LowPass, smoothing
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 # 0.5 Pa of noise per sample are then 0.7 um at 10 Hz and 2.3 um at 1 Hz
@@ -132,7 +132,7 @@ class FilmMonitor:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._laser, self._trim, self._root = EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S)
+        self._laser, self._trim, self._root = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
         self._seen_s, self._readings = 0.0, 0
         self._since = (
             _Since(SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um),
@@ -226,7 +226,7 @@ class PlausibilityCheck:
 
     def reset(self) -> None:
         """Forget everything: the mirror is not held."""
-        self._laser, self._gauge, self._optics = EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S), EarlyMean(SMOOTH_S)
+        self._laser, self._gauge, self._optics = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
         self._reference: tuple[float, float, float] | None = None
         self._age_s, self._readings = 0.0, 0
         self._seen_s = math.nan

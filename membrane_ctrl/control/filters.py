@@ -9,11 +9,15 @@ def smoothing(dt_s: float, time_constant_s: float) -> float:
 
 
 class LowPass:
-    """First-order lag that starts at its first input; a time constant of 0 passes the input through."""
+    """First-order lag that starts at its first input; a time constant of 0 passes the input through.
 
-    def __init__(self, time_constant_s: float) -> None:
+    `early_mean`: the plain mean of its inputs at first, of which none weighs more than the others.
+    """
+
+    def __init__(self, time_constant_s: float, early_mean: bool = False) -> None:
         self.time_constant_s = time_constant_s
         self.value = math.nan
+        self._age_s = 0.0 if early_mean else math.inf
 
     def reset(self, value: float) -> None:
         """Stand still at `value`; NaN: start at the next input."""
@@ -21,26 +25,11 @@ class LowPass:
 
     def update(self, given: float, dt_s: float) -> float:
         """Output after `given` was applied for `dt_s`."""
-        if math.isnan(self.value):
-            self.value = given
-        self.value += smoothing(dt_s, self.time_constant_s) * (given - self.value)
-        return self.value
-
-
-class EarlyMean(LowPass):
-    """A lag that is the plain mean of its inputs at first: none weighs more than the others."""
-
-    def __init__(self, time_constant_s: float) -> None:
-        super().__init__(time_constant_s)
-        self._age_s = 0.0
-
-    def update(self, given: float, dt_s: float) -> float:
-        """Mean after `given` was applied for `dt_s`."""
         self._age_s += dt_s
         if math.isnan(self.value):
             self.value = given
-        elif dt_s > 0:
-            self.value += max(smoothing(dt_s, self.time_constant_s), dt_s / self._age_s) * (given - self.value)
+        share = dt_s / self._age_s if dt_s > 0 else 0.0
+        self.value += max(smoothing(dt_s, self.time_constant_s), share) * (given - self.value)
         return self.value
 
 

@@ -91,10 +91,7 @@ class SagChange:
 
 
 def sag_change(
-    coeffs_um: FloatArray,
-    reference_um: FloatArray,
-    covariance_um2: FloatArray,
-    sensitivity: FloatArray,
+    coeffs_um: FloatArray, reference_um: FloatArray, covariance_um2: FloatArray, sensitivity: FloatArray
 ) -> SagChange:
     """Sag now minus sag at the reference, from coefficients (36,) and their covariance (36, 36).
 
