@@ -66,7 +66,8 @@ class RealisticShapes:
         if self._track:
             latency_s, residual_urad = round(self._rng.normal(0.013, 0.002), 5), round(self._rng.normal(30.0, 0.5), 2)
             found = replace(
-                found, kind="track", coeffs_um=noisy.round(3), sag_um=round(found.sag_um, 4), latency_s=latency_s,
+                found, kind="track", coeffs_um=noisy.round(3) + 0.0,
+                sag_um=round(found.sag_um, 4), latency_s=latency_s,
                 displacement_um=round(found.displacement_um, 3), slope_residual_urad=residual_urad,
             )  # fmt: skip
         return ring_trip(found)

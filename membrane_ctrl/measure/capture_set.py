@@ -145,7 +145,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     if content.kind == "fringes":
         if content.reference is None:
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
-        reference = (folder / content.reference).resolve()
+        reference = reference_of(content.reference, folder, path)
     sections = ("geometry", "camera", "pattern", "mirror")
     blamed = path if geometry is None else geometry.path  # the screen and the pattern may be incompatible
     optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
@@ -282,6 +282,14 @@ def require_inside(name: str, folder: Path, path: Path) -> None:
         inside = False
     if not inside or Path(name).is_absolute() or ".." in Path(name).parts:
         raise InputError(f"{path}: frames: {name!r} is outside the set's folder")
+
+
+def reference_of(name: str, folder: Path, path: Path) -> Path:
+    """The folder of the set that anchors this one. Raises InputError for a name that cannot be one."""
+    try:
+        return (folder / name).resolve()
+    except (OSError, ValueError, RuntimeError):  # a NUL, too long a name, circular links
+        raise InputError(f"{path}: reference: {name!r} leads to no folder") from None
 
 
 def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:

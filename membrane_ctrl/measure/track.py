@@ -17,7 +17,7 @@ from pydantic import Field
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.geometry.file import GeometryFile, read_geometry
-from membrane_ctrl.measure.capture_set import read_image, require_inside
+from membrane_ctrl.measure.capture_set import read_image, reference_of, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_figure
 from membrane_ctrl.metrology.full import BinFigure, measure_pixels, reconstruct_full
@@ -105,7 +105,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     """The figures of a set's frames. Raises InputError if the set or its reference is invalid."""
     content = read_track(folder)
     path = folder / "capture.toml"
-    reference = Figures(geometry).of((folder / content.reference).resolve())
+    reference = Figures(geometry).of(reference_of(content.reference, folder, path))
     _require_reference(content, reference, path)
     crossed, optics = content.pattern.crossed, reference.head.optics
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,15 @@ def edited(demo: Path, tmp_path: Path, change: Callable[[str], str]) -> Path:
         ('reference = "../full"', 'reference = "../nowhere"', "no such capture set"),
         ('reference = "../full"', 'reference = "../track"', "kind"),
         ('reference = "../full"\n', "", "reference: missing"),
+        ('reference = "../full"', 'reference = "a\\u0000b"', "leads to no folder"),
+        ('reference = "../full"', 'reference = "."', "kind"),
+        ('reference = "../full"', 'reference = ["../full"]', "reference"),
+        ("periods = 32", f"periods = 1{'0' * 40}", "pattern.crossed.periods"),
+        ("periods = 32", "periods = 32\ncontrast = nan", "pattern.crossed.contrast"),
+        ("shift_x_rad = 0.0", "shift_x_rad = 1e300", "shift_x_rad"),
+        ("time_s = 1.85", "time_s = 1e308", "not after"),
+        ("time_s = 1.85", "time_s = [1.85", "not valid TOML"),
+        ('file = "t_00001.png"', 'file = "a\\u0000b"', "outside the set's folder"),
         ("periods = 32", "periods = 16", "covers the reference's region"),
         ("period_mm = 49.82", "period_mm = 50.0", "the reference has 49.82"),
         ("time_s = 1.85", "time_s = nan", "time_s"),
@@ -79,18 +89,21 @@ def test_an_invalid_set_is_refused_in_one_line(
     shown = capsys.readouterr().err.strip().splitlines()
     assert said in shown[-1], shown
     assert len(shown) <= 2
+    assert not (tmp_path / "track/result").exists()
 
 
 def test_frames_of_another_size_are_refused_and_missing_ones_rejected(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = edited(demo, tmp_path, str)
+    (folder / "t_00005.png").unlink()
+    os.mkfifo(folder / "t_00005.png")
     (folder / "t_00006.png").unlink()
     (folder / "t_00007.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
     assert run(["track", str(folder), "--json", "--no-pictures"]) == 0
     table = json.loads(capsys.readouterr().out)
-    assert table["verdicts"] == {"ok": 6, "degraded": 0, "rejected": 2}
-    assert any("missing" in reason for reason in table["reasons"])
+    assert table["verdicts"] == {"ok": 5, "degraded": 0, "rejected": 3}
+    assert all(any(why in reason for reason in table["reasons"]) for why in ("missing", "pipe", "unreadable"))
     large = folder.parent / "large"
     assert run(["simulate", str(large), "--shrink", "8"]) == 0
     shutil.copy(large / "white.png", folder / "t_00006.png")

@@ -14,7 +14,8 @@ from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.metrology import phase
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.metrology.track.live import COVARIANCE_S, LOST_S, REJECTED_S, LiveTracker, Stethoscope
+from membrane_ctrl.metrology.track.live import COVARIANCE_S, LOST_S, REJECTED_S, LiveTracker, Stethoscope, _estimate
+from membrane_ctrl.metrology.track.tracked import rejected_frame
 from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -88,6 +89,14 @@ def test_every_frame_follows_the_film(bench: Bench) -> None:
     matrices = [id(e.covariance_um2) for e in (*found, *later)]
     assert len(set(matrices)) == 2  # the recorder stores a matrix once
     assert matrices.count(matrices[0]) == COVARIANCE_S * RATE_HZ
+
+
+def test_a_rounded_term_is_no_minus_zero() -> None:
+    """It is no whole number of nanometres to the recorder, which then stores all bits of every term."""
+    frame = replace(
+        rejected_frame(1.0, ""), coeffs_um=np.full(36, -1e-4), hencky_um=0.0, sag_um=0.0, sag_sigma_um=0.0
+    )
+    assert not np.signbit(_estimate(frame, math.nan, False, 1.0).coeffs_um).any()
 
 
 def test_the_pattern_steps_at_first_and_then_now_and_then(bench: Bench) -> None:

@@ -164,7 +164,7 @@ def _estimate(found: TrackedFrame, reading_um: float, tracking_lost: bool, urad:
     return ShapeEstimate(
         time_s=found.time_s,
         kind="track",
-        coeffs_um=np.round(found.coeffs_um, _UM),
+        coeffs_um=np.round(found.coeffs_um, _UM) + 0.0,  # a minus zero is no whole number to the recorder
         hencky_um=round(found.hencky_um, _UM),
         covariance_um2=found.covariance_um2,
         sag_um=round(found.sag_um, _UM + 1),  # a camera that repeats itself is known by equal sags
