@@ -191,7 +191,10 @@ class TwinHold:
         while not self.rows or self.rows[-1].state != telemetry.State.HOLD:
             self._advance(1)
             if self._run.now_s > _HELD_WITHIN_S:
-                raise HoldError(f"the twin is not held within {_HELD_WITHIN_S:g} s; is its configuration sound?")
+                raise HoldError(
+                    f"the twin is not held within {_HELD_WITHIN_S:g} s: if it swings, halve loop.kp_per_s and double "
+                    "loop.ti_s; else see `membrane-ctrl check`"
+                )
 
     def ask(self, command: Command) -> None:
         """Run the tick that executes the command. Raises HoldError if it is refused."""

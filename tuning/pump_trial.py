@@ -128,8 +128,8 @@ def _slowed(loop: schema.LoopConfig, found: pump_map.PumpMap, share: float) -> s
 def _checked(rig: HoldRig) -> tuple[float, float]:
     """The gain of the mirror on the curve in force, and its error, from steps of the flow.
 
-    Steps that see little in their weather are repeated for twice as long. Raises ValueError if the gain is far from
-    1, or differs above and below the holding flow.
+    Steps that contradict the curve, or see little in their weather, are repeated for twice as long. Raises ValueError
+    if the longest find a gain far from 1, or one that differs above and below the holding flow.
     """
     for steps_s in _CHECKS_S:
         _returned(rig)
@@ -141,8 +141,6 @@ def _checked(rig: HoldRig) -> tuple[float, float]:
         gain, sigma = found.model.gain, found.sigma.gain
         if not (characterise.judge(record, found).pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma)):
             return gain, sigma
-        if sigma < _CURVE_OFF / 2:
-            break
     raise ValueError(
         f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
         "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"

@@ -53,7 +53,7 @@ class Design:
     candidates: tuple[design.Candidate, ...]
     least_std_um: float
     preview: prediction.Preview
-    robustness: prediction.Robustness
+    robustness: design.Robustness
 
 
 @dataclass(frozen=True, slots=True)

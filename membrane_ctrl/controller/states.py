@@ -89,7 +89,8 @@ def settle(scene: Scene) -> State:
         scene.why = f"inside +-{band_um:g} um for {settled_s:.1f} s"
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
-        scene.overdue = f"not inside +-{band_um:g} um for {scene.config.states.settle_s:g} s"
+        swings = "if it swings, halve loop.kp_per_s and double loop.ti_s"
+        scene.overdue = f"not inside +-{band_um:g} um for {scene.config.states.settle_s:g} s: {swings}"
     return State.SETTLE
 
 

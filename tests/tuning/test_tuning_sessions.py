@@ -14,8 +14,8 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
-from tuning.proposal.design import NAMES, PRESENT, RefusedError, propose, table
-from tuning.proposal.prediction import ModelBench, preview, robustness, sampled_plants
+from tuning.proposal.design import NAMES, PRESENT, RefusedError, propose, robustness, sampled_plants, table
+from tuning.proposal.prediction import ModelBench, preview
 from tuning.rig import Rig
 
 RATIO_MAX = {

@@ -19,6 +19,7 @@ _LOST_MAX = 0.01
 _GAIN_SIGMA_MAX = 0.10  # an error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ
 _GAIN_SIGMA_GOOD = 0.03
 _DELAY_SIGMA_MAX_S = 0.1
+_DELAY_SIGMA_SHARE = 0.1  # or of the delay: the loop is as slow as its delay is long, and as tolerant
 _UNANSWERED = 5.0  # k below this many standard errors: the pump's effect is lost in the weather
 _JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
 _P_MIN = 1e-4
@@ -93,7 +94,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}")
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
         degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
-    if sigma.delay_s > _DELAY_SIGMA_MAX_S:
+    if sigma.delay_s > max(_DELAY_SIGMA_MAX_S, _DELAY_SIGMA_SHARE * model.delay_s):
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}")
     refused.extend(_bent(record, identified))
     if identified.independence_p < _P_MIN:
@@ -243,25 +244,26 @@ def fitted(done: Experiments) -> Characterised:
 
 
 def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Record, machine.Finished]:
-    """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold."""
+    """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
+
+    One that the guard stopped tells as much of its time as another: gusts stop sound experiments, too.
+    """
     done: Record | None = None
-    stopped: Record | None = None
     finished = machine.Finished(False, "")
     for _ in range(plan.relays):
         relay, finished = rig.perform(spec_of("relay", around, plan.relay_s))
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
-        if not finished.completed:
-            done, stopped = None, relay if stopped is None else stopped.followed_by(relay)
-            if finished.reason.startswith(machine.NO_ANSWER):
-                raise ExperimentError(f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}")
-            if _too_strong(stopped):
-                raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
-            continue
-        done, stopped = relay if done is None else done.followed_by(relay), None
-        found = identify(done)
-        if found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found):
-            break
-    if done is None:
+        done = relay if done is None else done.followed_by(relay)
+        if finished.reason.startswith(machine.NO_ANSWER) and not finished.completed:
+            raise ExperimentError(f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}")
+        if not finished.completed and _too_strong(done):
+            raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
+        if done.duration_s >= plan.relay_s:
+            found = identify(done)
+            if found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found):
+                return done, finished
+    assert done is not None
+    if done.duration_s < plan.relay_s:
         stopped_near = finished.reason.startswith(machine.STOPPED)
         raise ExperimentError(finished.reason + (f": {_FURTHER}" if stopped_near else ""))
     return done, finished

@@ -294,18 +294,28 @@ class DisturbanceModel:
         dt_s = self.rest.dt_s
         pump = loop_model.pump_response(model, w_rad_per_s, dt_s)
         total = self.rest.moving_psd(w_rad_per_s)
-        channels = (
-            (self.barometer, loop.feedforward_barometer, loop.barometer_gain_um_per_pa, loop.feedforward_filter_s),
-            (self.air, loop.feedforward_temperature, loop.temperature_gain_um_per_k, loop.gas_follows_air_s),
-        )
-        for weather, used, gain, filter_s in channels:
-            if weather is None:
-                continue
+        for weather, used, gain, filter_s in self._channels(loop):
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
             reaction = gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
             total = total + weather.psd(w_rad_per_s) * np.abs(weather.gain * lag - reaction) ** 2
             total = total + weather.noise**2 * dt_s * np.abs(reaction) ** 2
         return np.asarray(total, dtype=float)
+
+    def feedforward_psd(self, w_rad_per_s: Series, loop: LoopConfig) -> Series:
+        """Two-sided spectrum of the flow that the loop's feed-forward asks for, (um/s)^2 s."""
+        total = np.zeros_like(w_rad_per_s)
+        for weather, used, gain, filter_s in self._channels(loop):
+            rate = gain * w_rad_per_s / np.abs(1 + 1j * w_rad_per_s * filter_s) if used else 0.0
+            total = total + rate**2 * (weather.psd(w_rad_per_s) + weather.noise**2 * self.rest.dt_s)
+        return total
+
+    def _channels(self, loop: LoopConfig) -> list[tuple[WeatherGain, bool, float, float]]:
+        """Each weather sensor with its feed-forward: whether it is used, its gain and filter."""
+        channels = (
+            (self.barometer, loop.feedforward_barometer, loop.barometer_gain_um_per_pa, loop.feedforward_filter_s),
+            (self.air, loop.feedforward_temperature, loop.temperature_gain_um_per_k, loop.gas_follows_air_s),
+        )
+        return [(weather, *settings) for weather, *settings in channels if weather is not None]
 
 
 def observe(record: Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:

@@ -35,7 +35,8 @@ _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1500.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
-_CAUGHT = 0.75  # of the limit; the rest is for gusts and noise
+_CAUGHT = 0.55  # of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
+_SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them all the same
 _NONE_UM_PER_S = 1e-3  # at command 0
 _SHORTEST_S, _PULSE_S, _LONGEST_S = 0.05, 0.2, 20.0
 _MOST_VISITS = 6
@@ -78,7 +79,7 @@ class PumpSurvey:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
         if self._sure()[1].any():
-            self._share = min(1.0, self._share * (1.2 if completed else 0.8))
+            self._share = min(1.0, max(_SHARE_LEAST, self._share * (1.2 if completed else 0.8)))
         elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
             self._longer *= 2.0 if _sank(run) else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
@@ -117,8 +118,9 @@ class PumpSurvey:
 
     @property
     def full_um_per_s(self) -> float:
-        """The largest flow seen for certain."""
-        return max([1e-3, *(at.flow_um_per_s - 2 * at.sigma_um_per_s for at in self.fit.levels.values())])
+        """The largest flow seen for certain; a level that was only passed through may look strong."""
+        certain = [float((branch.flows - 2 * branch.sigmas).max()) for branch in self._branches.values()]
+        return max([1e-3, *certain])
 
     @property
     def holding(self) -> float:

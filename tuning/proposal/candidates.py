@@ -37,12 +37,11 @@ class Demands:
     recovery_s: float = 60.0  # three integral times at most
     # A further demand: as good an answer to that step as this one
     as_good_as: loop_model.LoadStep | None = None
-    # Standard deviations of the feedback's flow between the holding flow and zero, and of its change per tick within
-    # the rate limit: beyond, the limits clip the noise on one side and leave a bias
-    pump_sigmas: float = 1.7
-    # Price of the feedback's flow (share of the holding flow, squared) in the logarithm of the standard deviation;
-    # 0.3 suits the simulated pump, whose stalls and starts limit the prediction to a few per cent
-    activity_weight: float = 0.3
+    # Standard deviations of the flow's change per tick within the rate limit: beyond, it distorts the loop's answer
+    rate_sigmas: float = 1.7
+    # Of a reading behind the loop's filter: half of the band; beyond, a mirror at rest is seen to leave the band, and
+    # a hold takes minutes to settle
+    reading_um: float = 1.0
 
 
 def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
@@ -108,7 +107,8 @@ def least_variance(
 ) -> loop_model.Gains:
     """PI and filter with the least predicted variance of the true centre, within the demands.
 
-    No D: at best it improves the prediction by 1 %, for twice the pump's activity, which costs more.
+    No D: at best it improves the prediction by 1 %, for twice the pump's activity, and on pumps with a second of lag
+    by 5 %: the pump cannot give less than nothing.
 
     Only the feed-forward of `loop` matters, not its gains.
     """
@@ -116,17 +116,17 @@ def least_variance(
 
     def cost(gains: loop_model.Gains) -> float:
         found = predict(gains, model, disturbance, loop)
-        activity = found.flow_std_um_per_s / model.holding_flow_um_per_s
-        jump = demands.pump_sigmas * found.flow_step_std_um_per_s / (loop.flow_rate_limit_um_per_s2 * dt_s)
+        jump = demands.rate_sigmas * found.flow_step_std_um_per_s / (loop.flow_rate_limit_um_per_s2 * dt_s)
         peak = load_peak_um(gains, model, demands.load_step_um_per_s) / demands.load_peak_um
         slow = 3 * gains.ti_s / demands.recovery_s
-        shares = [demands.pump_sigmas * activity, jump, peak, slow]
+        reading = disturbance.laser_um * math.sqrt(dt_s / (dt_s + 2 * gains.filter_s)) / demands.reading_um
+        shares = [jump, peak, slow, reading]
         if demands.as_good_as is not None:
             answer = loop_model.load_step(gains, model, demands.load_step_um_per_s, dt_s)
             shares += [answer.peak_um / demands.as_good_as.peak_um]
             shares += [answer.recovery_s / max(demands.as_good_as.recovery_s, dt_s)]
         broken = sum(max(0.0, min(share, _SHARE_MOST) - 1) for share in shares)
-        return math.log(found.std_um) + demands.activity_weight * activity**2 + 10 * broken
+        return math.log(found.std_um) + 10 * broken
 
     starts = (simc(model, dt_s, filter_s, 1.2) for filter_s in _FILTERS_S if filter_s >= dt_s)
     return min((_search(model, dt_s, start, demands.ms, cost) for start in starts), key=cost)

@@ -1,8 +1,10 @@
 """Turns identified models into a proposal: candidates side by side, their gains and costs, and the proposed one."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
 
+import numpy as np
 from pydantic import ValidationError
 from rich.console import Group
 from rich.table import Table
@@ -18,6 +20,77 @@ from tuning.proposal import prediction
 # Ku = pi / (2 k d), Tu = 4 d. Noise makes theirs even larger.
 _RULE_FILTER_S = 0.2  # for rules that do not choose a filter, against the laser's noise
 _PLANTS = 40  # drawn from the fit, for each candidate's error bars: 1 sigma to a tenth
+
+
+def loop_figures(
+    gains: loop_model.Gains,
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    step_um_per_s: float,
+) -> loop_model.LoopFigures:
+    """The figures on one plant; infinite for an unstable loop."""
+    dt_s = disturbance.rest.dt_s
+    ms = loop_model.sensitivity_peak(gains, model, dt_s)
+    if not math.isfinite(ms):
+        return loop_model.LoopFigures(math.inf, math.inf, math.inf, math.inf)
+    answer = loop_model.load_step(gains, model, step_um_per_s, dt_s)
+    return loop_model.LoopFigures(
+        prediction.predict(gains, model, disturbance, loop).std_um, answer.peak_um, answer.recovery_s, ms
+    )
+
+
+def half_widths(found: Sequence[loop_model.LoopFigures]) -> loop_model.LoopFigures:
+    """Half of the central 68 % of each figure over many plants: 1 sigma; infinite if some of them are unstable."""
+    rows = np.array([astuple(figures) for figures in found])
+    low, high = np.quantile(rows, (0.16, 0.84), axis=0, method="nearest")
+    with np.errstate(invalid="ignore"):  # infinite at both ends
+        widths = np.where(np.isinf(high), np.inf, (high - low) / 2)
+    return loop_model.LoopFigures(*widths.tolist())
+
+
+# Evaluates a proposal on plants permitted by the data, drawn from the covariance of the fit.
+
+
+@dataclass(frozen=True, slots=True)
+class Robustness:
+    """Over the sampled plants: 95 % quantiles of sensitivity and standard deviation, and share of stable loops."""
+
+    ms_p95: float
+    std_p95_um: float
+    stable_fraction: float
+
+
+def sampled_plants(identified: identify.Identified, count: int, seed: int = 1) -> list[loop_model.PlantModel]:
+    """Plants drawn from the fit's covariance; times and gain stay positive."""
+    model = identified.model
+    centre = np.array([model.gain, model.dead_time_s, model.lag_s, model.leak_um_per_s])
+    draws = np.random.default_rng(seed).multivariate_normal(centre, identified.covariance, count)
+    floor = np.array([0.05 * model.gain, 0.0, 1e-3, 0.0])
+    return [loop_model.PlantModel(*row) for row in np.maximum(draws, floor).tolist()]
+
+
+def robustness(
+    gains: loop_model.Gains,
+    identified: identify.Identified,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    count: int = 60,
+) -> Robustness:
+    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad."""
+    plants = sampled_plants(identified, count)
+    dt_s = disturbance.rest.dt_s
+    peaks = np.array([loop_model.sensitivity_peak(gains, plant, dt_s) for plant in plants])
+    stable = np.isfinite(peaks)
+    stds = np.array(
+        [
+            prediction.predict(gains, p, disturbance, loop).std_um if ok else np.inf
+            for p, ok in zip(plants, stable, strict=True)
+        ]
+    )
+    # the next value above: interpolating between a number and infinity is impossible
+    peak_p95, std_p95 = (float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds))
+    return Robustness(peak_p95, std_p95, float(stable.mean()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +124,7 @@ class Proposal:
     candidates: tuple[Candidate, ...]  # including the chosen one and the present gains
     least_std_um: float  # the lower bound
     preview: prediction.Preview  # of the chosen one on the fitted twin
-    robustness: prediction.Robustness
+    robustness: Robustness
 
 
 class RefusedError(Exception):
@@ -146,14 +219,12 @@ def propose(
             "open the bleed or find the leak, then repeat"
         )
     settled = feedforward_settings(loop, disturbance)
-    plants = prediction.sampled_plants(identified, _PLANTS)
+    plants = sampled_plants(identified, _PLANTS)
 
     def row(name: str, gains: loop_model.Gains, around: LoopConfig) -> Candidate:
         made = candidate(name, gains, model, disturbance, around, demands)
         step = demands.load_step_um_per_s
-        spread = prediction.half_widths(
-            [prediction.loop_figures(gains, plant, disturbance, around, step) for plant in plants]
-        )
+        spread = half_widths([loop_figures(gains, plant, disturbance, around, step) for plant in plants])
         if made.predicted is not None:
             weather_um = made.predicted.std_um * disturbance.unsteady
             spread = replace(spread, std_um=math.hypot(spread.std_um, weather_um))
@@ -170,7 +241,7 @@ def propose(
         candidates=(chosen, row(PRESENT, loop_model.Gains.of(loop), loop), *designed[1:]),
         least_std_um=prediction.least_std_um(model, disturbance, settled),
         preview=prediction.preview(proposed, pump, model, disturbance),
-        robustness=prediction.robustness(chosen.gains, identified, disturbance, settled),
+        robustness=robustness(chosen.gains, identified, disturbance, settled),
     )
 
 

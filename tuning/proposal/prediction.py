@@ -8,17 +8,17 @@ it can be inverted. Preview: the real one-sided pump on the fitted plant.
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
+from scipy.special import ndtr
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.experiments.machine import BenchSample
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification import identify, loop_model
+from tuning.identification import loop_model
 from tuning.identification.disturbance import DisturbanceModel
 from tuning.rig import Rig
 
@@ -37,16 +37,70 @@ class Predicted:
 def predict(
     gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig
 ) -> Predicted:
-    """Linear prediction for a stable loop; only the preview includes the pump's limits."""
+    """Of a stable loop; the pump's limits count as they do on average (`limited`)."""
     dt_s = disturbance.rest.dt_s
     w = loop_model.frequencies(dt_s)
-    response = loop_model.loop_response(gains, model, w, dt_s)
-    sensitivity = 1 / (1 + response)
-    moving, noise = disturbance.psd(w, model, loop), disturbance.rest.white_psd
+    model, moving = limited(gains, model, disturbance, loop, w)
+    sensitivity, noise = 1 / (1 + loop_model.loop_response(gains, model, w, dt_s)), disturbance.rest.white_psd
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
     flow = np.abs(loop_model.controller_response(gains, w) * sensitivity) ** 2 * (moving + noise)
     change = flow * np.abs(2 * np.sin(w * dt_s / 2)) ** 2
-    return Predicted(*(math.sqrt(float(np.trapezoid(s * w, np.log(w))) / math.pi) for s in (centre, flow, change)))
+    return Predicted(*(math.sqrt(_variance(spectrum, w)) for spectrum in (centre, flow, change)))
+
+
+def _variance(psd: FloatArray, w: FloatArray) -> float:
+    return float(np.trapezoid(psd * w, np.log(w))) / math.pi
+
+
+_ROUNDS = 4  # of the swing and what the limits leave of it, each from the other: within 1 % of the preview's
+
+
+def limited(
+    gains: loop_model.Gains,
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    w: FloatArray,
+) -> tuple[loop_model.PlantModel, FloatArray]:
+    """The plant as a pump with limits drives it, and the spectrum of the centre without feedback at `w`, um^2 s.
+
+    The pump gives no less than nothing and no more than `loop.flow_max_um_per_s`. Statistical linearisation (Gelb and
+    Vander Velde, Multiple-Input Describing Functions, 1968, chapter 7): of a flow that swings like a Gaussian, the
+    limits leave a share, and add noise of their own, whose correlation is the square of the flow's.
+    """
+    dt_s, noise = disturbance.rest.dt_s, disturbance.rest.white_psd
+    controller, forward = loop_model.controller_response(gains, w), disturbance.feedforward_psd(w, loop)
+    plant, moving = model, disturbance.psd(w, model, loop)
+    for _ in range(_ROUNDS):
+        sensitivity = 1 / (1 + loop_model.loop_response(gains, plant, w, dt_s))
+        flow = np.abs(controller * sensitivity) ** 2 * (moving + noise) + forward
+        variance = _variance(flow, w)
+        share, rest = _clipped(math.sqrt(variance), model.holding_flow_um_per_s, loop.flow_max_um_per_s)
+        if share > 1 - 1e-3:
+            break
+        memory_s = _variance(flow**2, w) / variance**2
+        plant = replace(model, gain=model.gain * share)
+        added = rest * memory_s / (1 + (w * memory_s / 2) ** 2)
+        moving = disturbance.psd(w, plant, loop) + added * np.abs(loop_model.pump_response(model, w, dt_s) / w) ** 2
+    return plant, moving
+
+
+def _clipped(std: float, mean: float, most: float) -> tuple[float, float]:
+    """What limits of 0 and `most` leave of a Gaussian's small changes, and the variance that they add.
+
+    `mean` is that of the clipped flow; an integrator finds the unclipped one, as Newton's method does here.
+    """
+    before = mean = min(max(mean, 1e-3 * most), 0.999 * most)
+    for _ in range(20):
+        low, high = -before / std, (most - before) / std
+        inside, above = ndtr(high) - ndtr(low), most * ndtr(-high)
+        density = [math.exp(-0.5 * at * at) / math.sqrt(2 * math.pi) for at in (low, high)]
+        after = before * inside + std * (density[0] - density[1]) + above
+        if abs(after - mean) < 1e-3 * mean:
+            break
+        before += (mean - after) / max(inside, 1e-3)
+    square = (before**2 + std**2) * inside + std * (before * density[0] - (before + most) * density[1]) + most * above
+    return float(inside), float(max(0.0, square - after**2 - (inside * std) ** 2))
 
 
 def least_std_um(
@@ -128,74 +182,6 @@ class Walks:
             covariance = covariance + transition @ covariance @ transition.T
             transition = transition @ transition
         return transition, covariance
-
-
-def loop_figures(
-    gains: loop_model.Gains,
-    model: loop_model.PlantModel,
-    disturbance: DisturbanceModel,
-    loop: LoopConfig,
-    step_um_per_s: float,
-) -> loop_model.LoopFigures:
-    """The figures on one plant; infinite for an unstable loop."""
-    dt_s = disturbance.rest.dt_s
-    ms = loop_model.sensitivity_peak(gains, model, dt_s)
-    if not math.isfinite(ms):
-        return loop_model.LoopFigures(math.inf, math.inf, math.inf, math.inf)
-    answer = loop_model.load_step(gains, model, step_um_per_s, dt_s)
-    return loop_model.LoopFigures(
-        predict(gains, model, disturbance, loop).std_um, answer.peak_um, answer.recovery_s, ms
-    )
-
-
-def half_widths(found: Sequence[loop_model.LoopFigures]) -> loop_model.LoopFigures:
-    """Half of the central 68 % of each figure over many plants: 1 sigma; infinite if some of them are unstable."""
-    rows = np.array([astuple(figures) for figures in found])
-    low, high = np.quantile(rows, (0.16, 0.84), axis=0, method="nearest")
-    with np.errstate(invalid="ignore"):  # infinite at both ends
-        widths = np.where(np.isinf(high), np.inf, (high - low) / 2)
-    return loop_model.LoopFigures(*widths.tolist())
-
-
-# Evaluates a proposal on plants permitted by the data, drawn from the covariance of the fit.
-
-
-@dataclass(frozen=True, slots=True)
-class Robustness:
-    """Over the sampled plants: 95 % quantiles of sensitivity and standard deviation, and share of stable loops."""
-
-    ms_p95: float
-    std_p95_um: float
-    stable_fraction: float
-
-
-def sampled_plants(identified: identify.Identified, count: int, seed: int = 1) -> list[loop_model.PlantModel]:
-    """Plants drawn from the fit's covariance; times and gain stay positive."""
-    model = identified.model
-    centre = np.array([model.gain, model.dead_time_s, model.lag_s, model.leak_um_per_s])
-    draws = np.random.default_rng(seed).multivariate_normal(centre, identified.covariance, count)
-    floor = np.array([0.05 * model.gain, 0.0, 1e-3, 0.0])
-    return [loop_model.PlantModel(*row) for row in np.maximum(draws, floor).tolist()]
-
-
-def robustness(
-    gains: loop_model.Gains,
-    identified: identify.Identified,
-    disturbance: DisturbanceModel,
-    loop: LoopConfig,
-    count: int = 60,
-) -> Robustness:
-    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad."""
-    plants = sampled_plants(identified, count)
-    dt_s = disturbance.rest.dt_s
-    peaks = np.array([loop_model.sensitivity_peak(gains, plant, dt_s) for plant in plants])
-    stable = np.isfinite(peaks)
-    stds = np.array(
-        [predict(gains, p, disturbance, loop).std_um if ok else np.inf for p, ok in zip(plants, stable, strict=True)]
-    )
-    # the next value above: interpolating between a number and infinity is impossible
-    peak_p95, std_p95 = (float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds))
-    return Robustness(peak_p95, std_p95, float(stable.mean()))
 
 
 # The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.

@@ -20,7 +20,7 @@ from membrane_ctrl.config.schema import LoopConfig
 from tuning.gains_file import GainsFile
 from tuning.identification import disturbance, identify, loop_model
 from tuning.identification.loop_model import Record, Series
-from tuning.proposal.prediction import least_std_um, predict
+from tuning.proposal.prediction import least_std_um, limited, predict
 
 # Time of a stage, and growth that ends the trial there: early on only plain failures, as a minute of weather scatters
 # by a third; at the end the required 10 %.
@@ -90,9 +90,10 @@ def centre_std_um(off_um: Series, trial: VerificationTrial, weather: disturbance
     seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
     gains = loop_model.Gains.of(trial.after)
     w = loop_model.frequencies(dt_s, _POINTS)
-    sensitivity = np.abs(1 / (1 + loop_model.loop_response(gains, trial.model, w, dt_s))) ** 2
+    model, moving = limited(gains, trial.model, weather, trial.after, w)
+    sensitivity = np.abs(1 / (1 + loop_model.loop_response(gains, model, w, dt_s))) ** 2
     noise = weather.rest.white_psd
-    coloured = sensitivity * (weather.psd(w, trial.model, trial.after) + noise) - noise
+    coloured = sensitivity * (moving + noise) - noise
     expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
     predicted_um = predict(gains, trial.model, weather, trial.after).std_um
     return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
@@ -110,8 +111,8 @@ def seen_sensitivity(off_um: Series, trial: VerificationTrial) -> float:
     fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
     used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
     w, power = w[used], power[used]
-    s = np.abs(1 / (1 + loop_model.loop_response(gains, trial.model, w, dt_s))) ** 2
-    moving = trial.weather.psd(w, trial.model, trial.after)
+    model, moving = limited(gains, trial.model, trial.weather, trial.after, w)
+    s = np.abs(1 / (1 + loop_model.loop_response(gains, model, w, dt_s))) ** 2
     excess = power / (s * (moving + trial.weather.rest.white_psd))
     bands = np.floor(np.log(w / w[0]) / math.log(_BAND)).astype(int)
     means = np.array([excess[bands == band].mean() for band in np.unique(bands)])
