@@ -232,13 +232,15 @@ def test_the_smoothed_flows_are_as_wrong_as_they_say(shape: str, share: float) -
     assert np.max(np.abs(off)) < 3.6
 
 
-def test_first_pulses_are_longer_after_a_fall_and_shorter_after_a_rise() -> None:
+def test_first_pulses_are_longer_and_at_once_after_a_fall_and_shorter_after_a_rise() -> None:
     def pulses_s(end_um: float, completed: bool, times: int = 1) -> list[float]:
         survey = PumpSurvey(0.5)
         run = PumpRun(DT_S, *np.array([np.zeros(10), np.linspace(0.0, end_um, 10), np.zeros(10)]))
         for _ in range(times):
             survey.take(run, completed)
-        return [step.duration_s for step in survey.steps()[1::3]]
+        steps = survey.steps()
+        assert (steps[0].fraction > 0) == (end_um < 0 and not completed)
+        return [step.duration_s for step in steps if step.fraction > 0]
 
     as_planned = pulses_s(-5.0, completed=True)
     assert pulses_s(-5.0, completed=False) == pytest.approx([2 * s for s in as_planned])

@@ -206,11 +206,10 @@ def characterise(rig: ExperimentRig, limit_um: float = 10.0) -> Characterised:
 def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) -> Experiments:
     """Hold, relay and doublets on a rig that holds its mirror.
 
-    A stopped relay is discarded and repeated: the fit does not model whatever stopped it. Stopped doublets are
-    kept.
+    What was stopped is kept, and repeated while too little is known; `judge` sees a jump that stopped it.
 
-    Raises ExperimentError if no relay could be completed; ValueError if the pump has no room about the holding flow:
-    the mirror is too tight or too leaky.
+    Raises ExperimentError if the relays were stopped before they lasted as long as one; ValueError if the pump has no
+    room about the holding flow: the mirror is too tight or too leaky.
     """
     if plan.settle_s:
         rig.hold(plan.settle_s)

@@ -36,13 +36,13 @@ TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _CAUGHT = 0.55  # of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
-_SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them all the same
+_SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them as well
 _NONE_UM_PER_S = 1e-3  # at command 0
 _SHORTEST_S, _PULSE_S, _LONGEST_S = 0.05, 0.2, 20.0
 _MOST_VISITS = 6
 _ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
-_FIRST_ROUNDS = 5  # without any flow
+_FIRST_ROUNDS, _FIRST_RISE = 5, 0.2  # rounds without any flow; share of the limit at most, by a first pulse
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 
@@ -79,7 +79,7 @@ class PumpSurvey:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
         if self._sure()[1].any():
-            self._share = min(1.0, max(_SHARE_LEAST, self._share * (1.2 if completed else 0.8)))
+            self._share = float(np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0))
         elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
             self._longer *= 2.0 if _sank(run) else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
@@ -94,14 +94,15 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if not self._sure()[1].any():
-            if self._rounds >= (
-                _FIRST_ROUNDS if stuck(self.fit, self._branches.get(True, NO_BRANCH)) else 3 * _FIRST_ROUNDS
-            ):
+            hopeless = stuck(self.fit, self._branches.get(True, NO_BRANCH))
+            if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
                 return ()
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
-            rise_um = max(1.0, 1.5 * self.laser_um)  # shows in the noise
+            rise_um = min(max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um)  # shows in the noise
+            # after a round that sank, at once: it sinks further until the first gas arrives
+            down = [_for(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
             pulses = [
-                (_for(0.0, 20.0, -1.5 * rise_um), _for(first, longest_s, rise_um), _for(0.0, 0.5))
+                (*down, _for(first, longest_s, rise_um), _for(0.0, 0.5))
                 for longest_s in np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S).tolist()
             ]
             return tuple(step for pulse in pulses for step in pulse)
@@ -119,8 +120,7 @@ class PumpSurvey:
     @property
     def full_um_per_s(self) -> float:
         """The largest flow seen for certain; a level that was only passed through may look strong."""
-        certain = [float((branch.flows - 2 * branch.sigmas).max()) for branch in self._branches.values()]
-        return max([1e-3, *certain])
+        return max([1e-3, *(float((at.flows - 2 * at.sigmas).max()) for at in self._branches.values())])
 
     @property
     def holding(self) -> float:
