@@ -15,7 +15,9 @@ from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.errors import Exit
 from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import opening
+from tuning.identification.characterise import experiment, fitted
 from tuning.opening import TwinHold
+from tuning.rig import HoldRig
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,11 @@ REFUSALS = {
         "open the bleed",
         plant=lambda: ForeignPlant(ForeignPump("bottom unreachable", 25.0, 0.3, 0.3), 5, 0.8, 0.6, laser_um=0.5),
     ),
-    "relays stopped by noise": Refusal(
+    "relays stopped by weather": Refusal(
         ("characterise",),
         "repeat `tune characterise` with a larger --limit-um",
-        ("characterise", "--limit-um", "20"),
-        straight(seed=3, weather=2.0, laser_um=3.0),
+        ("characterise", "--limit-um", "30"),
+        straight(seed=2, weather=8.0, laser_um=3.0),
     ),
     "survey stopped by weather": Refusal(
         ("pump", "--limit-um", "30"),
@@ -119,3 +121,20 @@ def test_a_refusal_that_is_obeyed_is_not_given_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     obeyed(REFUSALS[name], tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("weather", [2.0, 4.0])
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_relays_that_noise_and_weather_stop_tell_the_gain(seed: int, weather: float) -> None:
+    """They were discarded, and the session asked for a larger limit."""
+    hold = TwinHold(
+        foreign_config(rate_hz=10.0), bench=foreign_bench(straight(seed=seed, weather=weather, laser_um=3.0)())
+    )
+    done = experiment(HoldRig(hold, "test"))
+    found = fitted(done)
+    model, sigma = found.identified.model, found.identified.sigma
+    assert not done.finished.completed or done.relays_s > 300.0
+    assert found.quality.verdict != "refused"
+    assert abs(model.gain - 1.0) < 3 * sigma.gain
+    assert sigma.gain < 0.1

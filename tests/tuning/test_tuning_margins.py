@@ -7,6 +7,8 @@ import math
 import control
 import numpy as np
 import pytest
+import scipy.optimize
+from scipy.signal import lfilter
 
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
@@ -22,7 +24,7 @@ from tuning.proposal.candidates import (
     simc,
 )
 from tuning.proposal.design import designs
-from tuning.proposal.prediction import Walks, least_std_um, predict, preview
+from tuning.proposal.prediction import Walks, _clipped, least_std_um, predict, preview
 
 DT_S = 1e-3
 DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay
@@ -181,3 +183,44 @@ def test_feed_forward_leaves_less_of_the_weather() -> None:
     weather, w = typical(LoopConfig()), np.array([0.3])
     off = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     assert weather.psd(w, PUMP, LoopConfig())[0] < 0.1 * weather.psd(w, PUMP, off)[0]
+
+
+@pytest.mark.parametrize(
+    ("gains", "cut"),
+    [(Gains(0.2, 5.2, 0.0, 0.1), 1.5), (Gains(0.6, 6.5, 0.0, 0.2), 1.2), (Gains(0.3, 13.7, 0.0, 0.2), 1.4)],
+)
+def test_the_prediction_counts_what_the_pumps_limits_cut(gains: Gains, cut: float) -> None:
+    """The barometer's feed-forward asks for less than nothing half of the time; the preview has the real pump."""
+    model = PlantModel(1.0, 0.13, 0.3, 0.4)
+    weather = DisturbanceModel(Noise(0.13, 0.0, 1e-3, 12.0, 0.1), WeatherGain(-0.37, 0.0, 2.0, 0.13, 0.0), None)
+    wide = LoopConfig(rate_hz=10.0, feedforward_temperature=False, flow_max_um_per_s=20.0)
+    loop = gains.applied_to(wide.model_copy(update={"flow_max_um_per_s": 2.3}))
+    pump = PumpConfig(flow_full_um_per_s=2.3, dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0)
+    held = [preview(loop, pump, model, weather, seed, duration_s=300.0).std_um for seed in (1, 2, 3)]
+    found_um = predict(gains, model, weather, loop).std_um
+    assert found_um == pytest.approx(np.mean(held), rel=0.15)  # 2 % with less cut, 11 % with most
+    # a plant that loses ten times as much has room for all of it
+    free_um = predict(gains, PlantModel(1.0, 0.13, 0.3, 8.0), weather, wide).std_um
+    assert found_um > cut * free_um
+
+
+@pytest.mark.parametrize(
+    ("std", "mean", "most"), [(0.9, 0.4, 2.3), (2.0, 1.0, 3.0), (5.0, 0.4, 10.0), (1.0, 4.8, 5.0)]
+)
+def test_what_limits_leave_of_a_gaussian(std: float, mean: float, most: float) -> None:
+    z = np.random.default_rng(7).standard_normal(400_000)
+    before = scipy.optimize.brentq(lambda at: np.clip(at + std * z, 0.0, most).mean() - mean, -60.0, 60.0)
+    after = np.clip(before + std * z, 0.0, most)
+    share, rest = _clipped(std, mean, most)
+    assert share == pytest.approx(np.mean(after * z) / std, abs=0.005)
+    assert rest == pytest.approx(after.var() - (share * std) ** 2, rel=0.03, abs=0.005)
+
+
+def test_a_noisy_laser_gets_a_filter_with_which_a_hold_settles() -> None:
+    loop = LoopConfig(rate_hz=20.0)
+    noise = Noise(2.3, 0.0, 0.0, 12.0, 0.05)
+    weather = DisturbanceModel(noise, None, None)
+    gains = least_variance(PlantModel(1.0, 0.23, 0.97, 1.75), weather, loop, Demands())
+    share = -math.expm1(-0.05 / gains.filter_s)
+    read = np.random.default_rng(1).normal(0.0, 2.3, 200_000)
+    assert np.std(lfilter([share], [1.0, share - 1.0], read)) < 1.25

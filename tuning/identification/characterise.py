@@ -245,7 +245,8 @@ def fitted(done: Experiments) -> Characterised:
 def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Record, machine.Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
 
-    One that the guard stopped tells as much of its time as another: gusts stop sound experiments, too.
+    One that the guard stopped tells as much of its time as another, unless the mirror jumped: gusts and a laser's
+    noise stop sound experiments, too.
     """
     done: Record | None = None
     finished = machine.Finished(False, "")
@@ -255,24 +256,26 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         done = relay if done is None else done.followed_by(relay)
         if finished.reason.startswith(machine.NO_ANSWER) and not finished.completed:
             raise ExperimentError(f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}")
-        if not finished.completed and _too_strong(done):
-            raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
-        if done.duration_s >= plan.relay_s:
+        try:
             found = identify(done)
-            if found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found):
-                return done, finished
-    assert done is not None
-    if done.duration_s < plan.relay_s:
+        except ValueError:  # too short to tell
+            continue
+        if not finished.completed and found.largest_residual > _JUMP_SIGMAS:
+            done = None
+        elif not finished.completed and _too_strong(found):
+            raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
+        elif _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found)):
+            break
+    if done is None or not _enough(done, plan):
         stopped_near = finished.reason.startswith(machine.STOPPED)
         raise ExperimentError(finished.reason + (f": {_FURTHER}" if stopped_near else ""))
     return done, finished
 
 
-def _too_strong(stopped: Record) -> bool:
+def _enough(relays: Record, plan: Plan) -> bool:
+    return relays.duration_s >= plan.relay_s
+
+
+def _too_strong(found: Identified) -> bool:
     """Whether the pump stopped these relays, and not the weather: the next one would end like them."""
-    try:
-        found = identify(stopped)
-    except ValueError:  # too short to tell
-        return False
-    stronger = found.model.gain - _CERTAIN_SIGMAS * found.sigma.gain > _TOO_STRONG
-    return stronger and found.largest_residual <= _JUMP_SIGMAS
+    return found.model.gain - _CERTAIN_SIGMAS * found.sigma.gain > _TOO_STRONG

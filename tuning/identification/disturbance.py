@@ -315,7 +315,7 @@ class DisturbanceModel:
             (self.barometer, loop.feedforward_barometer, loop.barometer_gain_um_per_pa, loop.feedforward_filter_s),
             (self.air, loop.feedforward_temperature, loop.temperature_gain_um_per_k, loop.gas_follows_air_s),
         )
-        return [(weather, *settings) for weather, *settings in channels if weather is not None]
+        return [(of, used, gain, filter_s) for of, used, gain, filter_s in channels if of is not None]
 
 
 def observe(record: Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
