@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import is_run
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
 
 _SEARCHES = 60  # of a run, evenly spread: a quarter of a second each
 _SHOWN = 6  # modes in the picture
@@ -195,14 +198,52 @@ def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[
     from membrane_ctrl.measure.pictures import log_pictures, result_recording
 
     picture = _draw(out / "modes.png", modes, begin_s)
-    with result_recording(out / "modes.rrd", "membrane_ctrl_modes") as recording:
+    with result_recording(out / "modes.rrd", "membrane_ctrl_modes", _layout(len(modes), picture)) as recording:
         recording.log("modes/report", rr.TextDocument("\n".join(lines)), static=True)
         for k, mode in enumerate(modes, start=1):
             at = [rr.TimeColumn("run_time", duration=mode.time_s - begin_s)]
-            for name in ("frequency_hz", "amplitude_nm"):
-                values = [getattr(line, name) for line in mode.lines]
+            frequency_hz = np.array([line.frequency_hz for line in mode.lines])
+            columns = {
+                "frequency_hz": frequency_hz,
+                "change_percent": 100 * (frequency_hz / frequency_hz[0] - 1),
+                "amplitude_nm": np.array([line.amplitude_nm for line in mode.lines]),
+            }
+            for name, values in columns.items():
+                recording.log(
+                    f"modes/{k}/{name}", rr.SeriesLines(names=f"{mode.frequency_hz:.2f} Hz", widths=2), static=True
+                )
                 recording.send_columns(f"modes/{k}/{name}", at, rr.Scalars.columns(scalars=values))
         log_pictures(recording, "modes/pictures", [picture])
+
+
+def _layout(count: int, picture: Path) -> "rrb.Blueprint":
+    """Changes of the frequencies and amplitudes beside the picture and the report."""
+    import rerun as rr
+
+    end = rr.TimeRangeBoundary.infinite()
+    whole = rr.blueprint.TimeAxis(view_range=rr.TimeRange(start=end, end=end))  # the default is a minute
+    plots = (("Change of the frequency, %", "change_percent"), ("Amplitude, nm RMS", "amplitude_nm"))
+    return rr.blueprint.Blueprint(
+        rr.blueprint.Horizontal(
+            rr.blueprint.Vertical(
+                *(
+                    rr.blueprint.TimeSeriesView(
+                        name=name,
+                        origin="/",
+                        axis_x=whole,
+                        contents=[f"+ /modes/{k}/{of}" for k in range(1, count + 1)],
+                    )
+                    for name, of in plots
+                ),
+                rr.blueprint.TextDocumentView(name="Modes", origin="/modes/report"),
+            ),
+            rr.blueprint.Spatial2DView(name="Shapes", origin=f"/modes/pictures/{picture.stem}"),
+        ),
+        rr.blueprint.TimePanel(state="collapsed", timeline="run_time"),
+        rr.blueprint.SelectionPanel(state="collapsed"),
+        rr.blueprint.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+    )
 
 
 def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
