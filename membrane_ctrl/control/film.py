@@ -23,6 +23,8 @@ _KNOWN_S, _KNOWN_READINGS, WARM_S = 5.0, 50, 3 * SMOOTH_S
 SINCE_MINUTES_S = 120.0
 # Creep of 17 um/h is 100 um ahead; a fresh film's own (1 % of compliance in a day) is 31 um.
 SINCE_HOURS_S = 6 * 3600.0
+# Of the limit within minutes: gusts, doors and setpoints use 0.17 of it in hours, 0.1 K of the gauge 0.1 more
+_DOUBTED_SHARE = 0.35
 # On a long way the sag's own uncertainty matters (pre-strain, an offset of the laser's zero).
 LAW_SHARE = 0.3
 # Film, laser's zero and Young's modulus are known well enough for this; a wrong unit is off by ten.
@@ -57,6 +59,7 @@ class _Since:
     laser_um: float = math.nan
     trim_um: float = 0.0
     root: float = math.nan
+    share: float = 0.0  # of what may be between them
 
     def apart(self, laser_um: float, trim_um: float, root: float, sag_um: float, dt_s: float) -> str:
         """Both readings, if they contradict each other; `root` is the cube root of the gauge pressure."""
@@ -66,7 +69,8 @@ class _Since:
         by_gauge_um = (sag_um - by_laser_um) * (root / self.root - 1)
         # A laser drift that the shape loop has compensated has not moved the film.
         apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
-        if apart_um > self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)):
+        self.share = apart_um / (self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)))
+        if self.share > 1.0:
             return f"laser {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
         share = smoothing(dt_s, self.follow_s)
         self.laser_um += share * by_laser_um
@@ -163,6 +167,11 @@ class FilmMonitor:
         )
 
     @property
+    def doubted(self) -> bool:
+        """Laser and gauge are further apart than by noise or drift, though within the limit."""
+        return self._since[0].share > _DOUBTED_SHARE
+
+    @property
     def _taut(self) -> bool:
         """There is a reference: from now on, a gauge that falls to zero does not mean a slack film."""
         return math.isfinite(self._since[0].root)
@@ -244,19 +253,27 @@ class PlausibilityCheck:
         return self._reference is not None
 
     def step(
-        self, dt_s: float, displacement_um: float, gauge_pressure_pa: float, estimate: ShapeEstimate | None
+        self,
+        dt_s: float,
+        displacement_um: float,
+        gauge_pa: float,
+        estimate: ShapeEstimate | None,
+        blind: bool = False,
     ) -> Liar:
-        """Process one tick of a held mirror; NaN without a good reading; the estimate only in its tick of arrival."""
+        """Process one tick of a held mirror; NaN without a good reading; the estimate only in its tick of arrival.
+
+        `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
+        """
         if math.isfinite(displacement_um):
             self._laser.update(displacement_um, dt_s)
-        if math.isfinite(gauge_pressure_pa):
-            self._gauge.update(gauge_pressure_pa, dt_s)
+        if math.isfinite(gauge_pa):
+            self._gauge.update(gauge_pa, dt_s)
         if estimate is not None and estimate.verdict != "rejected" and math.isfinite(estimate.sag_um):
             since_s = 0.0 if math.isnan(self._seen_s) else estimate.time_s - self._seen_s
             self._optics.update(estimate.sag_um, max(since_s, 0.0))
             self._seen_s = estimate.time_s
         means = (self._laser.value, self._optics.value, self._gauge.value)
-        if all(map(math.isfinite, means)):
+        if not blind and all(map(math.isfinite, means)):
             self._age_s, self._readings = self._age_s + dt_s, self._readings + 1
             self._judge(means, dt_s)
         return self.liar

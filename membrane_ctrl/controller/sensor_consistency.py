@@ -74,6 +74,7 @@ class SensorConsistency:
         self._pump = film_health.PumpHealth(config.pump.change_max)
         self._film = film.FilmMonitor(config.limits, config.optics.mirror)
         self._by_optics = config.by_optics
+        self._doubted = False
         self._growth = film.LeakGrowth()
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s
@@ -101,11 +102,13 @@ class SensorConsistency:
         else:
             self._film.reset()
             self.laser_gauge_apart = ""
+        events = self._doubt_sag(state)
         if state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um:
-            return self._rest()
+            return events + self._rest()
         self._look_at_camera(inputs)
-        events = self._judge_weather(inputs, dt_s)
-        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate)
+        events += self._judge_weather(inputs, dt_s)
+        blind = not inputs.now_s - self._camera_s <= self._fresh_s
+        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate, blind)
         self._lies_s = self._lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
         self.laser_moved = self._lies_s > film.WARM_S  # a knock is over: the estimate knows the laser's new place
         if self.laser_moved:
@@ -150,6 +153,16 @@ class SensorConsistency:
         self.gas_excess = ""
         self._plausibility.reset()
         return self._judge(film.Liar.NOBODY)
+
+    def _doubt_sag(self, state: State) -> list[Event]:
+        """Tell that optics without a laser may have missed a jump of the film; until the mirror is started anew."""
+        doubted = self._by_optics and state in safety.CONNECTED and (self._doubted or self._film.doubted)
+        if doubted == self._doubted:
+            return []
+        self._doubted = doubted
+        if not doubted:
+            return [MaintenanceOver("sag_doubted", "compared anew from here on")]
+        return [Maintenance("sag_doubted", "by the gauge the film has jumped unseen by the optics: start it anew")]
 
     def _look_at_camera(self, inputs: TickInputs) -> None:
         """Note when the camera last saw the film, and how often it repeated one shape bit by bit."""

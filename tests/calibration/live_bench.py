@@ -43,9 +43,7 @@ def config(place: Path | None = None, **limits: float) -> Config:
     return Config(
         twin=TwinConfig(scenario="quiet", start_error_um=-3.0, leak_time_constant_s=500.0),
         pump=PumpConfig(flow_full_um_per_s=60.0),
-        loop=LoopConfig(
-            rate_hz=20.0, flow_max_um_per_s=60.0, setpoint_ramp_um_per_s=40.0, flow_rate_limit_um_per_s2=100.0
-        ),
+        loop=LoopConfig(rate_hz=20.0, flow_max_um_per_s=60.0, setpoint_ramp_um_per_s=40.0),
         limits=LimitsConfig(**{"displacement_min_um": -4500.0, "displacement_max_um": 4500.0, **limits}),
         shape=ShapeConfig(period_s=2.0),
         optics=OpticsConfig(camera=CAMERA, geometry_file=place),

@@ -34,7 +34,6 @@ flow_full_um_per_s = 60.0
 [loop]
 flow_max_um_per_s = 60.0
 setpoint_ramp_um_per_s = 40.0
-flow_rate_limit_um_per_s2 = 100.0
 [shape]
 frame_interval_s = 0.02
 [optics]

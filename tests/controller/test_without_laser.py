@@ -411,6 +411,35 @@ def test_a_jump_at_the_start_that_optics_alone_miss_ends_in_the_safe_state() -> 
     assert _early(BY_OPTICS, 20.0, -40.0, _blind(-40.0, 20.0))[0] == "laser_gauge_apart"
 
 
+@pytest.mark.parametrize("um", [-14.0, 20.0])
+def test_a_smaller_jump_that_optics_alone_miss_is_told(um: float) -> None:
+    config = BY_OPTICS.model_copy(update=AT_10_HZ)
+    ticks = held(60.0, _blind(um, 20.0), config, AmbientChange(20.0, um / -0.358, 0.1), None, 0.2)
+    assert [notice.name for notice in told(ticks, Maintenance)] == ["sag_doubted"]
+    assert not told(ticks, Fault)
+
+
+def test_doors_and_setpoints_raise_no_doubt_of_the_optics() -> None:
+    moves = {600: Command("setpoint", "a test", "", 30.0), 1200: Command("setpoint", "a test", "", -20.0)}
+    config = BY_OPTICS.model_copy(update=AT_10_HZ)
+    assert not told(held(150.0, NOTHING, config, AmbientChange(30.0, 20.0, 0.1), moves, 0.2), Maintenance)
+
+
+@pytest.mark.parametrize("config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"])
+def test_a_camera_that_is_away_is_not_accused_of_a_jump_that_it_did_not_see(config: Config) -> None:
+    """Laser and gauge see the film jump and come back; the camera is away before and after it."""
+
+    def lose(wrong: Wrong, now_s: float) -> None:
+        wrong.barometer_lost = now_s > 49.9
+        wrong.camera_lost = 30.0 < now_s < 80.0
+
+    config = config.model_copy(update=AT_10_HZ)
+    ticks = held(95.0, lose, config, AmbientChange(50.0, 40.0 / 0.358, 0.1), None, 0.2)
+    assert not told(ticks, Plausibility)
+    assert not told(ticks, Fault)
+    assert true_um(ticks, 92.0).mean() == pytest.approx(true_um(ticks, 25.0, 30.0).mean(), abs=0.5)
+
+
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
 def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(config: Config) -> None:
     def fail(wrong: Wrong, now_s: float) -> None:
