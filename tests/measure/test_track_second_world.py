@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,10 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
-from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld
+from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld, Waves
 from tests.support.tracked_errors import CLEAN, MOVING, SIZE, TrackedErrors, errors_of, rms
 
 EFFECTS: dict[str, dict[str, float]] = {
@@ -56,6 +57,26 @@ def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
     assert rms(found.sag) < 2.0
 
 
+def test_light_that_wanders_bends_no_figure_where_the_bins_end(tmp_path: Path) -> None:
+    """Parts of fringes are left there, and take such light for shape, unless their weights fade."""
+    CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(tmp_path / "full")  # type: ignore[arg-type]
+    reference = Figures().of(tmp_path / "full")
+    scene = scene_of(reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
+    phases, jacobian = scene.phase_rad(scene.surface), scene.jacobian(scene.surface)
+    light = scene.light_adu[0] + np.sum(scene.light_adu[1:] * np.cos(phases), axis=0)
+    none, everything = np.zeros(light.size, np.float32), np.full(light.size, 1e6)
+    still = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)
+    places = phases / (2 * math.pi) * SIDE_MM / CROSSED
+    fields = [Waves(0.005, 75.0, 60.0, SIDE_MM / 2, seed).at(0.0, *places) for seed in range(8)]
+    off_um = []
+    for edge in (np.ones_like(scene.edge), scene.edge):
+        fitter = FrameFitter(replace(scene, edge=edge), jacobian)
+        fits = [fitter.fit((light * (1 + one)).astype(np.float32), (0.0, 0.0), still, everything) for one in fields]
+        off_um.append(rms(np.array([1e3 * (fit.surface.sag_mm - scene.surface.sag_mm) for fit in fits])))
+    assert off_um[0] > 0.015
+    assert off_um[1] < 0.3 * off_um[0], off_um
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_each_effect_alone(tmp_path: Path, effect: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,7 +87,8 @@ def test_each_effect_alone(tmp_path: Path, effect: str, capsys: pytest.CaptureFi
         print(f"\n{effect}: sag {rms(sag):.2f}, terms {rms(terms):.2f}, worst {worst:.2f}, ", end="")
         print(f"largest {np.abs(terms).max():.1f} sigma")
     assert {one.ok_share for one in seeds} == {1.0}
-    assert 0.7 < rms(terms) < 1.3
+    # a rolling shutter's bands leave much light, of which little bends the figure: bars are 1.5 times too large
+    assert (0.6 if EFFECTS[effect].get("rolling_s") else 0.7) < rms(terms) < 1.3
     assert 0.5 < rms(sag) < 1.6
 
 

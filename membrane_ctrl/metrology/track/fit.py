@@ -1,9 +1,9 @@
 """The fit of one frame: Gauss-Newton on the light of its bins, for the surface and for what changes smoothly.
 
 With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
-W Tukey's weights and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is kept from step to step and from
-frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It is made anew where steps shrink
-too slowly.
+W Tukey's weights, which fade where the bins end, and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is
+kept from step to step and from frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It
+is made anew where steps shrink too slowly.
 
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
@@ -12,7 +12,7 @@ A, z_x, z_y of a bin; l and b are the maps that the fits found. The angles of z 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,10 +43,10 @@ _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now th
 
 
 @kernel
-def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  # type: ignore[no-untyped-def]
-    """Rows of `out` (7, n): w r times dI by phi_x, by phi_y, by A, by B_x, by B_y; residual r, weight w.
+def _model(base, turn, shifts, maps, response, edge, seen, reach, out, start, stop):  # type: ignore[no-untyped-def]
+    """Rows of `out` (7, n): e w r times dI by phi_x, by phi_y, by A, by B_x, by B_y; residual r, Tukey's weight w.
 
-    `maps` (3, n) are level and swings, `reach` (n,) is where Tukey's weight ends; 0 leaves a bin out.
+    `maps` (3, n) are level and swings, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves a bin out.
     """
     bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
     for p in range(start, stop):
@@ -70,11 +70,12 @@ def _model(base, turn, shifts, maps, response, seen, reach, out, start, stop):  
         r = seen[p] - light
         u = r / reach[p] if reach[p] > 0 else 1.0
         w = (1 - u * u) * (1 - u * u) if u * u < 1 else 0.0
-        out[0, p] = -w * r * steep_x * sx
-        out[1, p] = -w * r * steep_y * sy
-        out[2, p] = w * r
-        out[3, p] = w * r * (cx + twice)
-        out[4, p] = w * r * (cy + twice)
+        pull = w * r * edge[p]
+        out[0, p] = -pull * steep_x * sx
+        out[1, p] = -pull * steep_y * sy
+        out[2, p] = pull
+        out[3, p] = pull * (cx + twice)
+        out[4, p] = pull * (cy + twice)
         out[5, p] = r
         out[6, p] = w
 
@@ -126,22 +127,22 @@ class FrameFitter:
             Residual from which a bin has no weight; 0 leaves it out.
         """
         inherited = self._inverse is not None
-        found = self._descend(seen_adu, shifts_rad, start, reach_adu)
+        found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=False)
         if not found.converged and inherited:  # perhaps the matrix is of another frame
             self._inverse = None
-            found = self._descend(seen_adu, shifts_rad, start, reach_adu)
+            found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=True)
         if not found.converged:
             self._inverse = None
         return found
 
     def _descend(
-        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
+        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach: FloatArray, patient: bool
     ) -> FrameFit:
-        """Take steps until they vanish, lead astray or need too many matrices."""
+        """Take steps until they vanish, lead astray or need too many matrices; small steps may if `patient`."""
         shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
         for _ in range(_MAX_STEPS):
-            self._evaluate(seen_adu, shifts_rad, shape, light, reach_adu)
-            if self._inverse is None and matrices < _MAX_MATRICES:
+            self._evaluate(seen_adu, shifts_rad, shape, light, reach)
+            if self._inverse is None:
                 self._inverse = self._inverted(shifts_rad, shape, light, self._out[6])
                 matrices, change = matrices + 1, math.inf  # its first step is not judged by an old one's last
             if self._inverse is None:
@@ -152,7 +153,7 @@ class FrameFitter:
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
             if not TOLERANCE_MM < change < _ASTRAY_MM:
                 break
-            if change > _SLOW * last and matrices < _MAX_MATRICES:
+            if change > _SLOW * last and (matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)):
                 self._inverse = None
         residual, weights = self._out[5].copy(), self._out[6].copy()
         return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM)
@@ -165,7 +166,7 @@ class FrameFitter:
 
         def run(start: int, stop: int) -> None:
             fixed = (self._base, turn, np.array(shifts_rad, np.float32), self._maps, self.scene.response)
-            _model(*fixed, seen_adu, reach, self._out, start, stop)
+            _model(*fixed, self.scene.edge, seen_adu, reach, self._out, start, stop)
 
         split(run, self.scene.index.size)
 
@@ -214,7 +215,7 @@ class FrameFitter:
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
         columns = self._columns(shifts_rad, shape, light)
-        matrix = ((columns * weights) @ columns.T).astype(float)
+        matrix = ((columns * (weights * self.scene.edge)) @ columns.T).astype(float)
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not kernels.invert(matrix):
@@ -224,9 +225,9 @@ class FrameFitter:
     def covariance_mm2(self, fit: FrameFit, shifts_rad: tuple[float, float], noise_adu: float) -> FloatArray:
         """Covariance (36, 36) of the parameters from what the fit leaves, or from the noise where that is larger.
 
-        Errors of neighbouring bins belong together (light that wanders): what a square of 1.6 fringes contributes to
-        the solution counts as one error, and the squares as independent. Maps of light are refitted with the surface,
-        so that their errors are in it.
+        Errors of neighbouring bins belong together (light that wanders): what a square contributes to the solution
+        counts as one error, and the squares as independent. Maps of light are refitted with the surface, so that
+        their errors are in it.
         """
         if self._inverse is None:  # the last frame was refused
             self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
@@ -234,7 +235,7 @@ class FrameFitter:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
         pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface, fit.light)
-        pull *= fit.weights * fit.residual_adu
+        pull *= self.scene.edge * fit.weights * fit.residual_adu
         sums = self.in_squares(pull)
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
@@ -242,9 +243,20 @@ class FrameFitter:
         return np.asarray(seen * np.outer(grown, grown))
 
     def in_squares(self, pull: Singles) -> FloatArray:
-        """Sums (rows, squares) of (rows, n) over squares of the mirror whose errors count as independent."""
-        blocks = squares(self.scene.position_mm, self.scene.surface.radius_mm, _BLOCKS)
-        return np.stack([np.bincount(blocks, row) for row in pull])
+        """Sums (rows, squares) of (rows, n) over squares of the mirror whose errors count as independent.
+
+        Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
+        are as large as those of squares that do not overlap.
+        """
+        place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        low = np.floor(place).astype(int)
+        upper = np.sin(np.pi / 2 * (place - low)) ** 2
+        (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
+        side = _BLOCKS + 2
+        number, total = low[1] * side + low[0], np.zeros((len(pull), side**2))
+        for share, on in ((left * below, 0), (right * below, 1), (left * above, side), (right * above, side + 1)):
+            total += [np.bincount(number + on, share * row, side**2) for row in pull]
+        return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
@@ -313,10 +325,11 @@ def stepped(
     weights = np.stack([fit.weights for fit in fits])
     good = ((weights > _FITS).all(axis=0) | (weights < _FAILS).all(axis=0)) & (np.abs(off_rad) < _FAR_RAD).all(axis=0)
     good &= (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
-    moved, variance, left_rad = _split(fitter, off_rad, swing * good)
+    moved, variance, left_rad = _split(fitter, off_rad, swing * good * np.sqrt(scene.edge))
     light = np.stack([solved[:, 0], *swing])
     light = np.where(good, light, scene.light_adu)
-    return scene.with_light(light, scene.beyond_mm + good * left_rad / scene.rad_per_mm), moved, variance
+    beyond_mm = scene.beyond_mm + good * left_rad / scene.rad_per_mm
+    return replace(scene, light_adu=light, beyond_mm=beyond_mm), moved, variance
 
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -6,9 +6,10 @@ bin, and shape that 36 terms cannot represent. Light and response of the panel a
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, phase, reconstruct
@@ -28,6 +29,10 @@ _RESPONSE_POWERS = (2, 3, 4, 5)
 # Across the mirror. Light is judged in squares of a twelfth of its diameter: with eight fringes, squares of a dark
 # part looked covered, and the error bars came out three times too small.
 _LEAST_FRINGES = 9
+# Light that wanders is orthogonal to shape over whole fringes; where bins end, parts of fringes are left, which cost
+# ten times the error. Weights that fade over this much of a fringe cost 9 % of noise.
+_FADES = 0.8
+_USUAL = 0.75  # quantile of the changes of phase, half of which are across the fringes
 _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
@@ -43,6 +48,7 @@ class CrossedScene:
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
     basis: Singles  # (36, n): Noll terms at the bins, for what changes smoothly
+    edge: Singles  # (n,): weight, which fades to 0 where the bins end
     position_mm: FloatArray  # (2, n): on the mirror
     # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5; zeros if straight
     response: FloatArray
@@ -76,10 +82,6 @@ class CrossedScene:
         v = 0.5 + 0.25 * np.cos(phase_rad).sum(axis=0)
         bent = self.response @ np.stack([v**k - v for k in _RESPONSE_POWERS])
         return np.asarray(2 * self.light_adu[1:].sum(axis=0) * bent)
-
-    def with_light(self, light_adu: FloatArray, beyond_mm: FloatArray) -> "CrossedScene":
-        """The same with light and shape as five steps of the crossed pattern saw them."""
-        return replace(self, light_adu=light_adu, beyond_mm=beyond_mm)
 
 
 def scene_of(
@@ -121,12 +123,16 @@ def scene_of(
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
-    index = np.flatnonzero(np.isfinite(coarse).all(axis=0))
+    known = np.isfinite(coarse).all(axis=0)
+    index = np.flatnonzero(known)
     grid = bins.BinGrid(tracer.geometry, camera, bin_px)
     points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
     bias = grid.averaging_bias_mm(tracer, points, shape, index)
     position = tracer.position_mm(points)
+    seen_rad = tracer.predict_screen(points, shape) * rad_per_mm
+    fringe = 2 * math.pi / _rad_per_bin(index, (rows, columns), seen_rad, _USUAL)
+    inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[1:-1, 1:-1].reshape(-1)[index]
     return CrossedScene(
         tracer=tracer,
         surface=shape,
@@ -136,6 +142,7 @@ def scene_of(
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
         basis=zernike.values(*position / shape.radius_mm).astype(np.float32),
+        edge=np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2).astype(np.float32) ** 2,
         position_mm=position,
         response=response,
         rad_per_mm=rad_per_mm,
@@ -146,11 +153,7 @@ def scene_of(
 def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> int:
     """The largest bins, made of whole ones of the reference, over which the fringes hardly average out."""
     fine_px = checked.binned.bin_px
-    shape = checked.binned.means.shape[1:]
-    change = np.full((2, *shape), np.nan)
-    change.reshape(2, -1)[:, figure.index] = phase_rad
-    along = [np.abs(np.diff(change, axis=axis)) for axis in (1, 2)]
-    per_px = max(float(np.nanquantile(a, 0.95)) for a in along) / fine_px
+    per_px = _rad_per_bin(figure.index, checked.binned.means.shape[1:], phase_rad, 0.95) / fine_px
     for side in _BINS_PX:
         if (
             side % fine_px == 0
@@ -161,6 +164,13 @@ def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> 
     if per_px > _PIXEL_RAD:
         raise ValueError(f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period")
     return fine_px
+
+
+def _rad_per_bin(index: IntArray, shape: tuple[int, ...], phase_rad: FloatArray, quantile: float) -> float:
+    """Change of phases (2, n) of x and y from bin to bin, a quantile of both; along rows or columns, the larger."""
+    pictures = np.full((2, *shape), np.nan)
+    pictures.reshape(2, -1)[:, index] = phase_rad
+    return max(float(np.nanquantile(np.abs(np.diff(pictures, axis=axis)), quantile)) for axis in (1, 2))
 
 
 def _coarser(fine: FloatArray, side: int) -> FloatArray:
