@@ -14,6 +14,7 @@ from benchmarks.pumps import worst_share
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.control.experiments.trial import PumpStep
 from membrane_ctrl.control.gas import PumpCurve
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
@@ -208,9 +209,52 @@ def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_no
 @pytest.mark.parametrize(("leak", "delay_s", "least_um"), [(2.4, 1.9, -0.7), (0.5, 0.1, -5.4), (6.0, 1.9, 0.0)])
 def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(leak: float, delay_s: float, least_um: float) -> None:
     survey = survey_of([0.3, 0.6], [leak - 0.2, leak + 0.2], leak, delay_s)
-    *_, run, rest = survey._visit(Level(0.6))
-    assert (run.fraction, rest.fraction) == (0.6, 0.0)
-    assert rest.until_um == pytest.approx(least_um)
+    steps = survey._visit(Level(0.6))
+    run = next(i for i, step in enumerate(steps) if step.fraction == 0.6 and step.until_um is None)
+    assert {step.fraction for step in steps[run + 1 :]} == {0.0}
+    assert steps[-1].until_um == pytest.approx(least_um)
+
+
+def furthest_um(steps: list[PumpStep], full: float, leak: float, delay_s: float) -> tuple[float, float]:
+    """Lowest and highest point of a mirror that follows `steps` behind a dead time, on a pump linear in its command."""
+    dt_s, at_um, heights, left = 0.01, 0.0, [0.0], list(steps)
+    sent = [leak / full] * round(delay_s / dt_s)
+    since_s = 0.0
+    while left:
+        now = left[0]
+        met = now.until_um is not None and (at_um <= now.until_um if now.fraction == 0 else at_um >= now.until_um)
+        if met or since_s > now.duration_s:
+            left.pop(0)
+            since_s = 0.0
+            continue
+        sent.append(now.fraction)
+        since_s += dt_s
+        at_um += (full * sent[len(sent) - 1 - round(delay_s / dt_s)] - leak) * dt_s
+        heights.append(at_um)
+    return min(heights), max(heights)
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("known", [True, False])
+def test_visits_in_a_row_wait_for_the_gas_of_each_other(delay_s: float, known: bool) -> None:
+    """The next run began while the mirror still sank: three at once lifted it by 12 um."""
+    full, leak, high = 13.0, 2.7, 0.55
+    fractions = [0.1, 0.25, high, 1.0][: 4 if known else 3]
+    survey = survey_of(fractions, [full * f for f in fractions], leak, delay_s)
+    lowest_um, highest_um = furthest_um(4 * survey._visit(Level(1.0)), full, leak, delay_s)
+    assert -7.0 < lowest_um
+    assert highest_um < 7.0
+
+
+def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
+    """With nothing known to lift it, it was to rise by 21 um at the full command."""
+    survey = survey_of([0.3, 0.6], [1.0, 1.9], 2.3, 1.5)
+    assert max(step.duration_s for step in survey.steps() if step.fraction > 0) <= 2.4
+    assert max(step.until_um or 0.0 for step in survey.steps()) <= 2.0
+    survey._rounds = 40 - 1  # in the end it looks further all the same, but waits for nothing
+    survey._wanted = {Level(0.3)}
+    assert [step.duration_s for step in survey._visit(Level(0.3)) if step.fraction > 0.6] == [2.4]
+    assert max(step.until_um or 0.0 for step in survey._visit(Level(0.3))) <= 3.0
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1500.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
+_HIGHEST = 0.25  # of the limit, where a run begins at most
 _CAUGHT = 0.55  # of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
 _SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them as well
 _NONE_UM_PER_S = 1e-3  # at command 0
@@ -78,7 +79,7 @@ class PumpSurvey:
     def take(self, run: PumpRun, completed: bool) -> None:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
         self._rounds += 1
-        if self._sure()[1].any():
+        if not self._scarce:
             self._share = float(np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0))
         elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
             self._longer *= 2.0 if _sank(run) else 0.5
@@ -93,7 +94,7 @@ class PumpSurvey:
         """The next round; empty when the curve is known, or cannot be known better in the time."""
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
-        if not self._sure()[1].any():
+        if self._scarce:
             hopeless = stuck(self.fit, self._branches.get(True, NO_BRANCH))
             if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
                 return ()
@@ -240,6 +241,12 @@ class PumpSurvey:
         ]
         return fresh + again
 
+    @property
+    def _scarce(self) -> bool:
+        """No flow is known, or, in the rounds of the first pulses, none that lifts the mirror."""
+        flows = self._sure()[1]
+        return not flows.any() or (self._rounds < 3 * _FIRST_ROUNDS and flows.max() <= self.fit.leak_um_per_s)
+
     def _sure(self) -> tuple[FloatArray, FloatArray]:
         """Commands whose flows are known to a third, and the flows."""
         if not self.runs:
@@ -256,21 +263,35 @@ class PumpSurvey:
         none = float(fractions[flows < 0.02 * flows[-1]].max(initial=0.0))
         return float(1.3 * flows[-1] * ((fraction - none) / (fractions[-1] - none)) ** 2)
 
+    def _least(self, fraction: float) -> float:
+        """Flow that a command has at least: that of the largest smaller one that is known."""
+        fractions, flows = (np.append(0.0, column) for column in self._sure())
+        return float(flows[fractions <= fraction][-1])
+
     def _visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
-        leak, travel_um = max(self.fit.leak_um_per_s, 0.05), self._travel_um
-        run, up = _for(level.fraction, self._run_s(level)), self._up()
+        leak, travel_um, run_s, up = max(self.fit.leak_um_per_s, 0.05), self._travel_um, self._run_s(level), self._up()
+        run = _for(level.fraction, run_s)
+        up_s = 60.0 if self._least(up) > leak else _FIRST_PULSES_S[-1]  # what an unknown command gives is not awaited
         if self._net(level) > 0:
+            late_s = self.fit.delay_s + self.fit.lag_s
+            late_um, caught_um = leak * late_s, _CAUGHT * self.limit_um  # it sinks by the first before a command shows
             bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
             above = [] if level.rising else [_for(self._higher(level), 0.1)]
-            late_um = leak * (self.fit.delay_s + self.fit.lag_s)  # by which it sinks before a command shows
-            down = _for(0.0, 60.0, min(bottom_um + late_um, 0.0))
+            # where nothing is known to lift it meanwhile it begins higher, so that its gas can be awaited
+            sinks_um = late_um + (leak - self._least(level.fraction)) * run_s
+            least_um = min(bottom_um + late_um, 0.0)
+            start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
+            first = [_for(up, up_s, bottom_um + start_um - least_um - 0.5), _for(0.0, 60.0, start_um)]
+            wait = [_for(0.0, max(0.1, late_s))] if start_um >= sinks_um - caught_um else []
             # a short run lifts it less than the leak takes meanwhile: the hold must catch it within the limit
-            wait = _for(0.0, max(0.3, self.fit.answer_s), min(late_um - _CAUGHT * self.limit_um, 0.0))
-            return [_for(up, 60.0, bottom_um - 0.5), down, *above, run, wait]
-        top_um = max(0.5 * travel_um - self._net(Level(up)) * self.fit.answer_s, -0.2 * travel_um)
-        rest = [_for(0.0, 0.3)] if level.rising else []
-        return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, 60.0, top_um), *rest, run]
+            until_um = min(late_um - caught_um, 0.0)
+            wait.append(_for(0.0, max(0.3, self.fit.answer_s - late_s * len(wait)), until_um))
+            return [*first, *above, run, *wait]
+        lifts_um = max(self._net(Level(up)), 0.0) * self.fit.answer_s
+        top_um = max(0.5 * travel_um - lifts_um, -0.2 * travel_um)
+        pause = [_for(0.0, 0.3)] if level.rising else []
+        return [_for(0.0, 60.0, 0.5 * travel_um), _for(up, up_s, top_um), *pause, run]
 
     @property
     def _travel_um(self) -> float:
@@ -287,9 +308,7 @@ class PumpSurvey:
         fresh, net = level not in self.fit.levels, self._net(level)
         longest_s, way_um = _LONGEST_S, self._travel_um
         if fresh:
-            # the guess may be wrong, but a pump gives no less than at the largest smaller command that is known
-            fractions, flows = (np.append(0.0, column) for column in self._sure())
-            sinks_um_per_s = self.fit.leak_um_per_s - float(flows[fractions <= level.fraction][-1])
+            sinks_um_per_s = self.fit.leak_um_per_s - self._least(level.fraction)  # the guess may be wrong
             longest_s = min(longest_s, way_um * (0.5 if net > 0 else 1.5) / max(sinks_um_per_s, 1e-3))
             way_um *= 0.6
         return max(min(way_um / max(abs(net), 0.05), longest_s), _PULSE_S)
