@@ -65,7 +65,7 @@ def map_pump(
         found = replace(found, pump=found.pump.model_copy(update=watched))
         loop = _safe(_freed(rig.good[0], before, found.pump), found)
         rig.set_gains(loop, "the measured curve of the pump", _MAP_S, pump=found.pump)
-        gain, sigma = _checked(rig)
+        gain, sigma = _checked(rig, found.delay_s + found.lag_s)
     except (characterise.ExperimentError, ValueError) as error:
         rig.go_back()
         raise errors.RejectedError(f"pump map: {error}") from None
@@ -125,7 +125,7 @@ def _slowed(loop: schema.LoopConfig, found: pump_map.PumpMap, share: float) -> s
     return loop.model_copy(update={"kp_per_s": share / late_s, "ti_s": 4 * late_s / share, "td_s": 0.0})
 
 
-def _checked(rig: HoldRig) -> tuple[float, float]:
+def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
     """The gain of the mirror on the curve in force, and its error, from steps of the flow.
 
     Steps that contradict the curve, or see little in their weather, are repeated for twice as long. Raises ValueError
@@ -134,7 +134,7 @@ def _checked(rig: HoldRig) -> tuple[float, float]:
     for steps_s in _CHECKS_S:
         _returned(rig)
         rig.hold(_CHECK_AFTER_S)
-        around = rig.around(rig.hold(_CHECK_BEFORE_S))
+        around = replace(rig.around(rig.hold(_CHECK_BEFORE_S)), late_s=late_s)
         machine.room(around)
         record, _ = rig.perform(characterise.spec_of("steps", around, steps_s))
         found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))

@@ -1,6 +1,6 @@
 """The first step of a session: relay until the gain is known, doublets until the dead time is, within bounds."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -119,6 +119,7 @@ _GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma
 _DEAD_TIME_SIGMA_S = 0.025  # within 0.05 s at 2 sigma
 _BETWEEN_S = 15.0
 _VALIDATE_LEAST_S = 10.0
+_LESS = 1.5  # by which pulses are smaller after some that were stopped
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +196,7 @@ def spec_of(
         holding_flow_um_per_s=around.holding_flow_um_per_s,
         laser_um=around.laser_um,
         gain=gain,
+        late_s=round(around.late_s, 2),
     )
 
 
@@ -218,11 +220,12 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) ->
     machine.room(around)  # without room a relay would only report that it was stopped
     relays, finished = _relays(rig, around, plan)
     found = identify(relays)
-    gain = found.model.gain
+    around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
     whole = relays
     longest_s = (relays.duration_s, relays.duration_s)
     for _ in range(0 if _bent(relays, found) else plan.doublets):
-        latest, _ = rig.perform(spec_of("doublets", around, plan.doublets_s, gain))
+        latest, ended = rig.perform(spec_of("doublets", around, plan.doublets_s, gain))
+        gain *= 1.0 if ended.completed else _LESS
         if latest.duration_s > longest_s[1] - longest_s[0]:
             longest_s = (whole.duration_s, whole.duration_s + latest.duration_s)
         whole = whole.followed_by(latest, rig.hold(_BETWEEN_S))
@@ -262,9 +265,11 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
             continue
         if not finished.completed and found.largest_residual > _JUMP_SIGMAS:
             done = None
-        elif not finished.completed and _too_strong(found):
+            continue
+        if not finished.completed and _too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
-        elif _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found)):
+        around = replace(around, late_s=found.model.delay_s)
+        if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found)):
             break
     if done is None or not _enough(done, plan):
         stopped_near = finished.reason.startswith(machine.STOPPED)

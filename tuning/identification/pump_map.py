@@ -234,3 +234,15 @@ def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tup
     apart = means - mean
     spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
     return full * mean, full**2 * spread
+
+
+def may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
+    """By how much the flow may be off the straight line in each interval: where the chords beside it would meet.
+
+    There is no flow below the first command, and perhaps no more of it beyond the last.
+    """
+    widths = np.diff(fractions)
+    slopes = np.diff(flows) / widths
+    before, after = np.append(0.0, slopes[:-1]) - slopes, np.append(slopes[1:], 0.0) - slopes
+    across = np.where(before * after < 0, before * after, 0.0)
+    return np.abs(across * widths / np.where(across, before - after, 1.0))

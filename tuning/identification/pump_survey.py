@@ -22,6 +22,7 @@ from tuning.identification.pump_map import (
     PumpMap,
     Surveyed,
     first_jump,
+    may_bend,
     smoothed,
     stuck,
 )
@@ -82,7 +83,7 @@ class PumpSurvey:
         if not self._scarce:
             self._share = float(np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0))
         elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
-            self._longer *= 2.0 if _sank(run) else 0.5
+            self._longer *= 2.0 if run.sank else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
         self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
@@ -102,10 +103,8 @@ class PumpSurvey:
             rise_um = min(max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um)  # shows in the noise
             # after a round that sank, at once: it sinks further until the first gas arrives
             down = [_for(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
-            pulses = [
-                (*down, _for(first, longest_s, rise_um), _for(0.0, 0.5))
-                for longest_s in np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S).tolist()
-            ]
+            lengths_s = np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S).tolist()
+            pulses = ((*down, _for(first, longest_s, rise_um), _for(0.0, 0.5)) for longest_s in lengths_s)
             return tuple(step for pulse in pulses for step in pulse)
         self._want()
         made: list[PumpStep] = []
@@ -206,7 +205,7 @@ class PumpSurvey:
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
-        for (low, high), off in zip(pairwise(fractions.tolist()), _may_bend(fractions, flows), strict=True):
+        for (low, high), off in zip(pairwise(fractions.tolist()), may_bend(fractions, flows), strict=True):
             if off > _BENT_SHARE * full and high - low > _NEAREST:
                 found.append(_rounded((low + high) / 2))
         return found
@@ -270,16 +269,16 @@ class PumpSurvey:
 
     def _visit(self, level: Level) -> list[PumpStep]:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
-        leak, travel_um, run_s, up = max(self.fit.leak_um_per_s, 0.05), self._travel_um, self._run_s(level), self._up()
-        run = _for(level.fraction, run_s)
+        leak, travel_um, up = max(self.fit.leak_um_per_s, 0.05), self._travel_um, self._up()
+        run = _for(level.fraction, self._run_s(level))
         up_s = 60.0 if self._least(up) > leak else _FIRST_PULSES_S[-1]  # what an unknown command gives is not awaited
         if self._net(level) > 0:
             late_s = self.fit.delay_s + self.fit.lag_s
-            late_um, caught_um = leak * late_s, _CAUGHT * self.limit_um  # it sinks by the first before a command shows
+            late_um, caught_um = leak * late_s, _CAUGHT * self._share * self.limit_um  # sinks before an answer
             bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
             above = [] if level.rising else [_for(self._higher(level), 0.1)]
             # where nothing is known to lift it meanwhile it begins higher, so that its gas can be awaited
-            sinks_um = late_um + (leak - self._least(level.fraction)) * run_s
+            sinks_um = late_um + (leak - self._least(level.fraction)) * run.duration_s
             least_um = min(bottom_um + late_um, 0.0)
             start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
             first = [_for(up, up_s, bottom_um + start_um - least_um - 0.5), _for(0.0, 60.0, start_um)]
@@ -341,24 +340,6 @@ class PumpSurvey:
             return float(lifts[0])
         may = (_rounded(f) for f in np.linspace(fractions[-1], 1.0, 9).tolist())
         return next((f for f in may if self._net(Level(f)) > self.fit.leak_um_per_s), 1.0)
-
-
-def _may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
-    """By how much the flow may be off the straight line in each interval: where the chords beside it would meet.
-
-    There is no flow below the first command, and perhaps no more of it beyond the last.
-    """
-    widths = np.diff(fractions)
-    slopes = np.diff(flows) / widths
-    before, after = np.append(0.0, slopes[:-1]) - slopes, np.append(slopes[1:], 0.0) - slopes
-    across = np.where(before * after < 0, before * after, 0.0)
-    return np.abs(across * widths / np.where(across, before - after, 1.0))
-
-
-def _sank(run: PumpRun) -> bool:
-    """Whether the mirror was below where it began at the end of a run."""
-    read_um = run.displacement_um[np.isfinite(run.displacement_um)]
-    return bool(read_um.size and read_um[-1] < read_um[0])
 
 
 def _for(fraction: float, duration_s: float, until_um: float | None = None) -> PumpStep:

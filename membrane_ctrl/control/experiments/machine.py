@@ -7,10 +7,9 @@ stood.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Protocol
-
-import numpy as np
 
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import LowPass
@@ -28,6 +27,9 @@ class BenchSample:
 
 
 FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed, for a reading with little noise
+# A moving mirror continues for the pump's delay and lag after the flow is reduced: 0.24 s, up to twice that on a slow
+# bench, unless more is known; pulses turn within the longest
+_LATE_S, _LATE_MOST_S = 0.4, 1.0
 STOPPED = "stopped at"  # begins the reason of an experiment that the guard ended
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
@@ -49,7 +51,8 @@ class Around:
     full_flow_um_per_s: float
     laser_um: float  # standard deviation of a reading
     limit_um: float = 10.0  # largest excursion of the centre from where it stood
-    stretch: float = 1.0  # of the filters, for a noisy laser with few readings (`quiet_stretch`)
+    late_s: float = _LATE_S  # delay and lag of the pump, if known
+    stretch: float = 1.0  # of the filters, for a noisy laser with few readings (`quieted`)
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
@@ -63,17 +66,14 @@ class Experiment(Protocol):
         """Flow in um/s until the next reading, or the end."""
 
 
-# A moving mirror continues for the pump's delay (0.24 s, up to twice that on a slow bench) after the flow is reduced
-_DELAY_S = 0.4
-
-
 class CentreMotion:
     """Position and speed of the centre from noisy readings: two lags, and their difference over their times'."""
 
-    def __init__(self, stretch: float = 1.0) -> None:
+    def __init__(self, stretch: float = 1.0, late_s: float = _LATE_S) -> None:
         self._fast_s, self._slow_s = stretch * FAST_S, stretch * SLOW_S
         self._fast, self._slow = LowPass(self._fast_s), LowPass(self._slow_s)
-        self.coast_s = _DELAY_S + self._fast_s  # from a reading to its effect: the filter is late as well
+        # from a reading to its effect: the filter is late as well
+        self.coast_s = min(max(late_s, _LATE_S), _LATE_MOST_S) + self._fast_s
         self.lost_s = 0.0
 
     def update(self, displacement_um: float, dt_s: float) -> None:
@@ -113,24 +113,39 @@ _IN_HAND_SHARE = 0.22
 _STRETCHES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
 
-def quiet_stretch(laser_um: float, limit_um: float, rate_hz: float) -> float:
-    """Filters of this many times their length leave the noise its share of the limit; the longest if none does."""
-    share_um = _IN_HAND_SHARE * limit_um / _IN_HAND_SIGMAS
-    quiet = (s for s in _STRETCHES if laser_um * CentreMotion(s).noise_per_laser_um(rate_hz) <= share_um)
-    return next(quiet, _STRETCHES[-1])
+def quieted(around: Around, rate_hz: float) -> Around:
+    """With filters that leave the noise its share of the limit; if none does, the longest for the usual delay."""
+    share_um = _IN_HAND_SHARE * around.limit_um / _IN_HAND_SIGMAS
+    for late_s, stretch in product((around.late_s, _LATE_S), _STRETCHES):
+        if around.laser_um * CentreMotion(stretch, late_s).noise_per_laser_um(rate_hz) <= share_um:
+            break
+    return replace(around, late_s=late_s, stretch=stretch)
+
+
+_PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2 s late
+_BACK_WITHIN_UM, _BACK_MOST_S = 1.0, 40.0
 
 
 class ExcursionGuard:
-    """Lets an experiment run while the centre can still be stopped within the limit.
+    """Lets an experiment run while the centre can still be stopped within the limit, then brings it back.
 
     The centre is judged where it will come to rest, position + speed x time to react, with a margin of three standard
     deviations of that figure's own noise, which grows with fewer readings per second. Raises ValueError, with a
     remedy, if the margin uses up the limit.
+
+    Back it goes on the holding flow with a weak pull: behind a curve other than the configured one, an integrator
+    would wind up on the way and carry the mirror further past the centre than the experiment may. An experiment that
+    sets raw commands (`raw`) ends where it is.
     """
 
-    def __init__(self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float) -> None:
+    def __init__(
+        self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float, raw: bool = False
+    ) -> None:
         self._experiment = experiment
-        self._motion = CentreMotion(around.stretch)
+        self._around, self._raw = around, raw
+        self._ended: Finished | None = None
+        self._back_s = 0.0
+        self._motion = CentreMotion(around.stretch, around.late_s)
         self._centre_um = centre_um
         in_hand_um = _IN_HAND_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
@@ -142,11 +157,24 @@ class ExcursionGuard:
         self._limit_um = around.limit_um
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
-        """The experiment's step, or the end of it."""
+        """The experiment's step, then the way back, then the experiment's end."""
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:
-            return Finished(False, f"the laser reading was lost for {_LOST_MAX_S:g} s: check the laser, then repeat")
+            lost = f"the laser reading was lost for {_LOST_MAX_S:g} s: check the laser, then repeat"
+            return self._ended or Finished(False, lost)
         off_um = self._motion.position_um - self._centre_um
+        if self._ended is None:
+            found = self._guarded(off_um, measurement, dt_s)
+            if self._raw or not isinstance(found, Finished):
+                return found
+            self._ended = found
+        self._back_s += dt_s
+        if abs(off_um) < _BACK_WITHIN_UM or self._back_s > _BACK_MOST_S:
+            return self._ended
+        back_um_per_s = self._around.holding_flow_um_per_s - _PULL_PER_S * off_um
+        return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
+
+    def _guarded(self, off_um: float, measurement: BenchSample, dt_s: float) -> float | Finished:
         coming_um = off_um + self._motion.coast_s * self._motion.speed_um_per_s
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
@@ -165,8 +193,6 @@ class Patterned:
     too slow to disturb the pattern, and harmless to the identification, which knows the flow.
     """
 
-    PULL_PER_S = 0.15
-
     def __init__(
         self, around: Around, pattern: Callable[[float], float], duration_s: float, centre_um: float
     ) -> None:
@@ -174,7 +200,7 @@ class Patterned:
         self._pattern = pattern
         self._duration_s = duration_s
         self._centre_um = centre_um
-        self._motion = CentreMotion(around.stretch)
+        self._motion = CentreMotion(around.stretch, around.late_s)
         self._time_s = 0.0
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
@@ -182,55 +208,10 @@ class Patterned:
         if self._time_s >= self._duration_s:
             return Finished(True, "done")
         self._motion.update(measurement.displacement_um, dt_s)
-        back_um_per_s = self.PULL_PER_S * (self._centre_um - self._motion.position_um)
+        back_um_per_s = _PULL_PER_S * (self._centre_um - self._motion.position_um)
         pattern_um_per_s = self._pattern(self._time_s)
         self._time_s += dt_s
         return self._around.within(self._around.holding_flow_um_per_s + pattern_um_per_s + back_um_per_s)
-
-
-# Flows in time for `Patterned`, sized so that the mirror stays within a few um. Each takes the identified gain: the
-# same excursion on a strong and a weak pump.
-
-Pattern = Callable[[float], float]
-
-_SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
-
-
-def steps(around: Around, gain: float, hold_s: float = 2.0) -> Pattern:
-    """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
-    up, down = room(around)
-    size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
-    levels = (size, 0.0, -size, 0.0)
-    return lambda time_s: levels[int(time_s / hold_s) % 4]
-
-
-def doublets(around: Around, gain: float, pulse_s: float = 0.3) -> Pattern:
-    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead time from lag.
-
-    The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
-    """
-    up, down = room(around)
-    size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
-    down = min(down, size)
-    period_s = pulse_s * (1 + size / down)
-    return lambda time_s: size if time_s % period_s < pulse_s else -down
-
-
-def multisine(
-    around: Around, gain: float, slowest_rad_per_s: float = 0.3, fastest_rad_per_s: float = 6.0, tones: int = 12
-) -> Pattern:
-    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
-
-    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
-    """
-    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
-    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
-    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
-    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
-    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
-    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
-    scale = min(min(room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
-    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
 
 
 def room(around: Around) -> tuple[float, float]:
@@ -277,7 +258,7 @@ class Relay:
         self._centre_um = centre_um
         self._duration_s = duration_s
         self._threshold_um = THRESHOLD_SHARE * around.limit_um
-        self._motion = CentreMotion(around.stretch)
+        self._motion = CentreMotion(around.stretch, around.late_s)
         first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
         self._amplitudes_um_per_s = {1: first, -1: first}
         self._speeds_um_per_s = {1: first, -1: first}

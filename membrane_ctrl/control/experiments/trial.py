@@ -1,8 +1,10 @@
 """One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from firmware_iface.settings import Fraction, Section
@@ -42,6 +44,7 @@ class ExperimentSpec(Section):
     holding_flow_um_per_s: Annotated[float, Field(gt=0, le=100)]  # mean of the hold before
     laser_um: Annotated[float, Field(ge=0, le=20)]  # standard deviation of a reading
     gain: Annotated[float, Field(ge=0.02, le=50)] = 1.0  # k, of what was identified so far
+    late_s: Annotated[float, Field(ge=0, le=10)] = 0.4  # delay and lag, likewise
     steps: Annotated[tuple[PumpStep, ...], Field(max_length=90)] = ()  # of the pump map
 
 
@@ -74,7 +77,56 @@ class PumpSteps:
         return self._in_step_s > now.duration_s
 
 
-_PATTERNS = {"steps": machine.steps, "doublets": machine.doublets, "multisine": machine.multisine}
+# Flows in time for `Patterned`, sized so that the mirror stays within a few um. Each takes the identified gain: the
+# same excursion on a strong and a weak pump.
+
+Pattern = Callable[[float], float]
+
+_SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
+
+
+def steps(around: machine.Around, gain: float, hold_s: float = 2.0) -> Pattern:
+    """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
+    up, down = machine.room(around)
+    size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
+    levels = (size, 0.0, -size, 0.0)
+    return lambda time_s: levels[int(time_s / hold_s) % 4]
+
+
+def doublets(around: machine.Around, gain: float, pulse_s: float = 0.3) -> Pattern:
+    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead time from lag.
+
+    The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
+    """
+    up, down = machine.room(around)
+    size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
+    down = min(down, size)
+    period_s = pulse_s * (1 + size / down)
+    return lambda time_s: size if time_s % period_s < pulse_s else -down
+
+
+def multisine(
+    around: machine.Around,
+    gain: float,
+    slowest_rad_per_s: float = 0.3,
+    fastest_rad_per_s: float = 6.0,
+    tones: int = 12,
+) -> Pattern:
+    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
+
+    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
+    """
+    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
+    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
+    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
+    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
+    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
+    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
+    scale = min(min(machine.room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
+    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
+
+
+_PATTERNS = {"steps": steps, "doublets": doublets, "multisine": multisine}
 
 
 class Trial:
@@ -92,10 +144,11 @@ class Trial:
             full_flow_um_per_s=loop.flow_most_um_per_s(pump),
             laser_um=spec.laser_um,
             limit_um=spec.limit_um,
-            stretch=machine.quiet_stretch(spec.laser_um, spec.limit_um, loop.rate_hz),
+            late_s=spec.late_s,
         )
+        around = machine.quieted(around, loop.rate_hz)
         experiment = self._machine(around, centre_um)
-        self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz)
+        self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz, self.raw)
         self._left_s = spec.duration_s
 
     def _machine(self, around: machine.Around, centre_um: float) -> machine.Experiment:
