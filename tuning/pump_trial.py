@@ -78,7 +78,7 @@ def map_pump(
 
 
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
-    _returned(rig)
+    _brought_back(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
@@ -98,7 +98,7 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
                 loop = _freed(*rig.good, found.pump).model_copy(update=_CAUTIOUS)
                 rig.set_gains(_slowed(loop, found, _SLOWER), "pump map", _MAP_S, pump=found.pump)
         # a hold that swings may do; one that stays away ends every round at once
-        held = _returned(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
+        held = _brought_back(rig) or run.fraction.size * rig.dt_s > _AT_ONCE_S
     return survey.result(held)
 
 
@@ -145,6 +145,21 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
         f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
         "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
     )
+
+
+def _brought_back(rig: HoldRig) -> bool:
+    """`_returned`; if slow gains leave it above in strong weather, with those that held the mirror before.
+
+    From above a faster loop only stops the pump; from below it would drive a stuck one.
+    """
+    if _returned(rig):
+        return True
+    rows = rig.ticks(_BACK_S)
+    if np.mean(rig.record(rows).filled_displacement_um()) < rows[-1].target_um + rows[-1].trim_um:
+        return False
+    own = rig.good[0].model_dump(include=set(_CAUTIOUS))
+    rig.set_gains(rig.loop.model_copy(update=own), "pump map", _MAP_S)
+    return _returned(rig)
 
 
 def _returned(rig: HoldRig) -> bool:

@@ -343,6 +343,26 @@ def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() ->
     assert not pump_trial._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
+def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back: bool) -> None:
+    """In strong weather slow gains left it 8 um high for three minutes, and a sound pump was refused."""
+    own = LoopConfig(kp_per_s=0.5, ti_s=8.0)
+    given: list[LoopConfig] = []
+
+    class Rig(Standing):
+        loop, good = own.model_copy(update={"kp_per_s": 0.12, "flow_max_um_per_s": 3.0}), (own, PumpConfig())
+
+        def ticks(self, duration_s: float) -> list[SimpleNamespace]:
+            here_um = 6.5 if given else 6.5 + above_um
+            return [SimpleNamespace(target_um=5.0, trim_um=1.5, displacement_um=here_um)] * round(duration_s / 0.1)
+
+        def set_gains(self, loop: LoopConfig, *_: object) -> None:
+            given.append(loop)
+
+    assert pump_trial._brought_back(Rig(0.0, 0.0)) == back  # type: ignore[arg-type]
+    assert [(loop.kp_per_s, loop.flow_max_um_per_s) for loop in given] == [(0.5, 3.0)] * back
+
+
 @pytest.mark.parametrize(
     ("seen", "lasted_s", "kept"),
     [([(1.1, 0.02, False)], [120.0], True), ([(2.5, 0.5, True), (1.2, 0.2, False)], [120.0, 240.0], True),
