@@ -91,8 +91,10 @@ def with_moved_screen(values: FloatArray, truth: Truth, base: SetPhases, seed: i
     )
 
 
-def seen_directly(values: FloatArray, tilt_deg: tuple[float, float], seed: int, name: str = "direct") -> SetPhases:
-    """The screen 900 mm before the camera, by rays that meet a plane."""
+def seen_directly(
+    values: FloatArray, tilt_deg: tuple[float, float], seed: int, name: str = "direct", glass_mm: float = 0.0
+) -> SetPhases:
+    """The screen 900 mm before the camera, by rays that meet a plane, its pixels behind glass."""
     rng, bench = np.random.default_rng((seed, 2)), bench_at(STATED, values)
     facing = Rotation.from_euler("XYZ", [*tilt_deg, 40.0], degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
     there, axes = bench.geometry, (bench.geometry.rotation.T @ facing).T
@@ -100,6 +102,8 @@ def seen_directly(values: FloatArray, tilt_deg: tuple[float, float], seed: int, 
     column, row = rng.uniform(0, 2447, 1200), rng.uniform(0, 2047, 1200)
     start, along = axes @ (there.pinhole_mm - origin), axes @ there.rays(column, row)
     seen = (start[:, None] - start[2] / along[2] * along)[:2]
+    lean = np.arcsin(np.linalg.norm(along[:2], axis=0) / np.linalg.norm(along, axis=0) / 1.5)
+    seen = seen + glass_mm * np.tan(lean) * along[:2] / np.linalg.norm(along[:2], axis=0)
     inside = (np.abs(seen) < 199).all(axis=0)
     sigma = PIXEL_SIGMA_MM * np.sqrt(1200 / (2448 * 2048))
     screen_mm = seen[:, inside] / bench.pitch + rng.normal(0, sigma, (2, np.count_nonzero(inside)))
@@ -138,6 +142,18 @@ def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag_and_tell_the_truth
     assert sag_um["both"] < 5  # the goal
     focal = NAMES.index("focal_relative")
     assert solution.sigmas[focal] < 1e-5
+
+
+@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(4, 9))])
+def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> None:
+    """A millimetre of glass was taken for another lens, or another screen."""
+    values, truth, problem = bench_of(seed)
+    glass_mm = float(np.random.default_rng(seed).uniform(0.5, 2.0))
+    tilts = ((0.0, 25.0), seed), ((25.0, 0.0), seed + 50)
+    direct = tuple(seen_directly(values, *each, glass_mm=glass_mm) for each in tilts)
+    solution = solve(replace(problem, sets=(*direct, *problem.sets)))
+    assert_true(solution, values, truth, 3)
+    assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx([glass_mm] * 2, rel=0.3)
 
 
 def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:

@@ -55,12 +55,14 @@ class Elsewhere:
     deeper_um: float  # by how much the film was deeper then, by the laser
     motion_um: float  # in the x frames than in the y frames
     motion_sigma_um: float
+    glass_sigma_mm: float = 0.0  # of a screen seen directly, in place of a film that is deeper
 
     def known(self, laser_sigma_um: float) -> FloatArray:
         """Values and sigmas (2, MOVED), in mm and degrees: the move, the film deeper, deeper in x than in y."""
         deeper_mm = 1e-3 * np.array([self.deeper_um, self.motion_um])
         told = np.concatenate([self.shift_mm, np.zeros(3), deeper_mm])
-        film_mm = 1e-3 * np.array([np.sqrt(2) * laser_sigma_um, max(self.motion_sigma_um, STILL_UM)])
+        deeper_sigma_mm = self.glass_sigma_mm or 1e-3 * np.sqrt(2) * laser_sigma_um
+        film_mm = np.array([deeper_sigma_mm, 1e-3 * max(self.motion_sigma_um, STILL_UM)])
         # a rail is as parallel to the screen's normal as the screen is to itself after the move
         across_mm = np.sqrt(np.sum(np.square(self.shift_mm)) - np.square(self.shift_mm)) * np.radians(
             self.turn_sigma_deg
@@ -69,8 +71,9 @@ class Elsewhere:
         return np.stack([told, np.concatenate([shift_mm, np.full(3, self.turn_sigma_deg), film_mm])])
 
 
-# of the screen seen directly: nothing is known of its place
-ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0)
+# of the screen seen directly: nothing is known of its place, and its pixels may lie behind some mm of glass
+ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
+_GLASS_INDEX = 1.52
 
 
 @dataclass(frozen=True)
@@ -256,6 +259,9 @@ def _derivatives(
     out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
     out[:, COLUMNS - 2] = across * square / onto / BOW_RADIUS_MM**2
+    if surface is None:  # by 1 mm of glass over the pixels, which bends rays that lean
+        sine = across / np.linalg.norm(m.leaves, axis=0) / _GLASS_INDEX
+        out[:, MOTION] = deeper(sine / np.sqrt(1 - np.sum(sine**2, axis=0))) / 4
     out /= bench.pitch
     out[:, COLUMNS - 1] = -m.screen_mm / bench.pitch**2
     return out
