@@ -343,6 +343,14 @@ def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() ->
     assert not pump_trial._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("full", "least", "holds"), [(5.0, 0.3, True), (3.9, 0.3, False), (5.0, 2.5, False)])
+def test_a_curve_that_ends_near_the_leak_does_not_hold_the_mirror_meanwhile(
+    full: float, least: float, holds: bool
+) -> None:
+    pump = PumpConfig.model_validate({"curve_fraction": [0.1, 0.9], "curve_um_per_s": [least, full]})
+    assert pump_trial._holds(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
+
+
 @pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
 def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back: bool) -> None:
     """In strong weather slow gains left it 8 um high for three minutes, and a sound pump was refused."""
