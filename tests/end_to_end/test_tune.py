@@ -96,9 +96,9 @@ def test_the_hold_ends_the_experiment_of_a_session_that_has_gone(logs: Path) -> 
     link._client.ask(do="tune", experiment=spec.model_dump())
     link._client.close()  # killed: nothing is released
     watcher = HoldRig(connected_in_any_state(logs), "watcher")
-    states = [watcher._next_held().state for _ in range(480)]
-    assert states[0] == State.TUNE
-    assert states[-1] == State.HOLD
+    assert watcher._next_held().state == State.TUNE
+    most_ticks = round((8.0 + 45.0) / watcher.dt_s)  # and the way back
+    assert any(watcher._next_held().state == State.HOLD for _ in range(most_ticks))
     watcher._link.close()
 
 

@@ -123,7 +123,10 @@ def quieted(around: Around, rate_hz: float) -> Around:
 
 
 _PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2 s late
-_BACK_WITHIN_UM, _BACK_MOST_S = 1.0, 40.0
+_BACK_SHARE, _BACK_MOST_S = (
+    0.2,
+    40.0,
+)  # of the limit, where the loop takes over; with a wrong holding flow it stays off
 
 
 class ExcursionGuard:
@@ -169,7 +172,7 @@ class ExcursionGuard:
                 return found
             self._ended = found
         self._back_s += dt_s
-        if abs(off_um) < _BACK_WITHIN_UM or self._back_s > _BACK_MOST_S:
+        if abs(off_um) < _BACK_SHARE * self._limit_um or self._back_s > _BACK_MOST_S:
             return self._ended
         back_um_per_s = self._around.holding_flow_um_per_s - _PULL_PER_S * off_um
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
