@@ -106,7 +106,7 @@ def test_a_door_slammed_in_the_relay_ends_it_and_the_mirror_is_held() -> None:
     assert not end.completed
     assert "something else moved the mirror" in end.reason
     assert record.duration_s < 30.0 + 41.0  # of the way back
-    assert abs(bench.true_um[-1]) < 2.0
+    assert abs(bench.true_um[-1]) < 3.0
     assert held_again(rig, bench)
 
 
