@@ -123,10 +123,8 @@ def quieted(around: Around, rate_hz: float) -> Around:
 
 
 _PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2 s late
-_BACK_SHARE, _BACK_MOST_S = (
-    0.2,
-    40.0,
-)  # of the limit, where the loop takes over; with a wrong holding flow it stays off
+_BACK_SHARE = 0.2  # of the limit, within which the loop takes over
+_BACK_MOST_S = 40.0  # with a wrong holding flow the pull ends further off
 
 
 class ExcursionGuard:

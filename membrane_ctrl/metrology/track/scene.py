@@ -111,15 +111,8 @@ def scene_of(
         seen = f"only {fringes:.0f} fringes across the mirror"
         raise ValueError(f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period")
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
-    fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
-    coarser_rad = traced / phase.mm_per_rad(optics.pattern)  # the reference's errors repeat with its fringes
-    for axis, beyond_mm in enumerate(figure.points.screen_mm - traced):
-        fine[axis].reshape(-1)[figure.index] = _without_harmonics(beyond_mm, coarser_rad[axis])
     response, level_range = _response(checked, figure, traced, phase.mm_per_rad(optics.pattern), optics)
-    fine[2] = checked.view.light
-    fine[3:] = contrast * checked.view.swing_adu.mean(axis=0) / 2  # each axis has half of the panel's range
-    if level_range is not None:
-        fine[2:].reshape(3, -1)[:, figure.index] = level_range * np.array([[1.0], [contrast / 4], [contrast / 4]])
+    fine = _pictures(checked, figure, traced, phase.mm_per_rad(optics.pattern), level_range, contrast)
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
@@ -148,6 +141,26 @@ def scene_of(
         rad_per_mm=rad_per_mm,
         half_side_mm=optics.pattern.periods * optics.pattern.period_mm / 2,
     )
+
+
+def _pictures(
+    checked: Checked,
+    figure: full.BinFigure,
+    traced: FloatArray,
+    mm_per_rad: float,
+    level_range: FloatArray | None,
+    contrast: float,
+) -> FloatArray:
+    """Of the reference (5, rows, columns): screen points beyond `traced` in mm, light and both swings in ADU."""
+    fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
+    coarser_rad = traced / mm_per_rad  # the reference's errors repeat with its fringes
+    for axis, beyond_mm in enumerate(figure.points.screen_mm - traced):
+        fine[axis].reshape(-1)[figure.index] = _without_harmonics(beyond_mm, coarser_rad[axis])
+    fine[2] = checked.view.light
+    fine[3:] = contrast * checked.view.swing_adu.mean(axis=0) / 2  # each axis has half of the panel's range
+    if level_range is not None:
+        fine[2:].reshape(3, -1)[:, figure.index] = level_range * np.array([[1.0], [contrast / 4], [contrast / 4]])
+    return fine
 
 
 def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> int:
