@@ -27,7 +27,7 @@ _AT_ONCE_S = 1.5  # a round that begins at its limit is over
 _BEFORE_S = 20.0  # whose mean flow about holds the mirror
 _DARK_MOST = 3  # experiments in a row that a lost laser ended
 _CHECK_BEFORE_S, _CHECKS_S, _CHECK_AFTER_S = 40.0, (120.0, 240.0, 480.0), 15.0
-_CURVE_OFF = 0.2  # of k; the margins tolerate more
+_CURVE_OFF, _CERTAIN = 0.2, 4.0  # of k; the margins tolerate more. Standard errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,8 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
     """The gain of the mirror on the curve in force, and its error, from steps of the flow.
 
     Steps that contradict the curve, or see little in their weather, are repeated for twice as long. Raises ValueError
-    if the longest find a gain far from 1, or one that differs above and below the holding flow.
+    if the longest find a gain far from 1, or one that differs above and below the holding flow; one that they do not
+    know contradicts nothing.
     """
     for steps_s in _CHECKS_S:
         _returned(rig)
@@ -147,8 +148,11 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
         record, _ = rig.perform(characterise.spec_of("steps", around, steps_s))
         found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))
         gain, sigma = found.model.gain, found.sigma.gain
-        if not (characterise.judge(record, found).pump_unknown or abs(gain - 1) > max(_CURVE_OFF, 4 * sigma)):
+        contradicted = bool(characterise.bent(record, found)) or abs(gain - 1) > max(_CURVE_OFF, _CERTAIN * sigma)
+        if not contradicted and sigma < _CURVE_OFF:
             return gain, sigma
+    if not contradicted:
+        return gain, sigma
     raise ValueError(
         f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
         "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"

@@ -310,7 +310,7 @@ def verify_step(
     accepted = load_gains(session.file("gains.toml")).candidate == offered(session)[1].name
     session.begin("verify")
     model, weather = found_of(session).identified.model, disturbance_of(session)
-    trial = verify.VerificationTrial(model, weather, before, after, accepted)
+    trial = verify.VerificationTrial(model, weather, before, after, accepted, rig.pump)
     trial_s = verify.settle_s(after) + 2 * stages[-1][0] + _SPARE_S
     rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
     looks: list[verify.Stage] = []

@@ -32,7 +32,7 @@ _PER_INTERVAL = 16  # chords of the cubic between two points: within 0.1 % of it
 class _StraightLine:
     """Flow in proportion to the command beyond `dead_fraction`."""
 
-    highest_fraction = 1.0
+    lowest_fraction, highest_fraction = 0.0, 1.0
 
     def __init__(self, pump: PumpConfig) -> None:
         self._full, self._dead = pump.flow_full_um_per_s, pump.dead_fraction
@@ -52,7 +52,7 @@ class _Measured:
 
     def __init__(self, fractions: Sequence[float], flows_um_per_s: Sequence[float]) -> None:
         self._fractions, self._flows = _monotone_cubic(fractions, flows_um_per_s)
-        self.highest_fraction = fractions[-1]
+        self.lowest_fraction, self.highest_fraction = fractions[0], fractions[-1]
 
     def flow(self, fraction: float) -> float:
         return _between(self._fractions, self._flows, fraction) if fraction >= self._fractions[0] else 0.0
@@ -113,9 +113,10 @@ class PumpCurve:
 
     def __init__(self, pump: PumpConfig) -> None:
         self._start_fraction = pump.start_fraction
-        self._least_fraction = pump.stall_fraction + STALL_MARGIN
         self._rising: _StraightLine | _Measured = branch(pump, pump.curve_um_per_s)
         self._falling: _StraightLine | _Measured = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
+        # Below its first command a measured curve knows no running pump, on its falling branch either
+        self._least_fraction = max(pump.stall_fraction + STALL_MARGIN, self._falling.lowest_fraction)
         self._flow_um_per_s = 0.0
         self._kick_left_s = KICK_S
 
@@ -139,7 +140,7 @@ class PumpCurve:
 
     def command(self, flow_um_per_s: float, dt_s: float) -> float:
         """Command for a flow; a stopped pump gets a start pulse."""
-        if flow_um_per_s < 0.5 * self.least_flow_um_per_s:
+        if flow_um_per_s <= 0.5 * self.least_flow_um_per_s:
             self.stopped()
             return 0.0
         branch = self._rising if flow_um_per_s > self._flow_um_per_s else self._falling

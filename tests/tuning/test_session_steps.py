@@ -44,7 +44,7 @@ def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
     record, bench = held(LOOP)
     true_um = float(np.std(bench.true_um[1500:]))
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    assert centre_std_um(record.displacement_um, trial, WEATHER) == pytest.approx(true_um, rel=0.2)
+    assert centre_std_um(record.displacement_um, trial, WEATHER, LOOP) == pytest.approx(true_um, rel=0.2)
 
 
 def test_a_slow_loop_is_given_longer_to_forget_the_change() -> None:
@@ -92,8 +92,8 @@ def test_a_setpoint_that_moved_is_no_deviation() -> None:
     walk_um = 5.0 * np.sin(np.arange(len(record)) * 1e-4)
     moved = replace(record, displacement_um=record.displacement_um + walk_um)
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    plain_um = centre_std_um(record.displacement_um, trial, WEATHER)
-    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER) == pytest.approx(plain_um, rel=1e-9)
+    plain_um = centre_std_um(record.displacement_um, trial, WEATHER, LOOP)
+    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER, LOOP) == pytest.approx(plain_um, rel=1e-9)
 
 
 def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um: np.ndarray) -> list[ShapeEstimate]:

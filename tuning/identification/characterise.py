@@ -96,7 +96,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
         degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
     if sigma.delay_s > max(_DELAY_SIGMA_MAX_S, _DELAY_SIGMA_SHARE * model.delay_s):
         refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}")
-    refused.extend(_bent(record, identified))
+    refused.extend(bent(record, identified))
     if identified.independence_p < _P_MIN:
         degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {MAP_THE_PUMP}")
     if identified.whiteness_p < _P_MIN:
@@ -104,7 +104,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
     return refused, degraded
 
 
-def _bent(record: Record, identified: Identified) -> list[str]:
+def bent(record: Record, identified: Identified) -> list[str]:
     """The problem, if one gain does not describe both halves of the pump's range."""
     found = two_gains(record, identified)
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
@@ -223,7 +223,7 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) ->
     around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
     whole = relays
     longest_s = (relays.duration_s, relays.duration_s)
-    for _ in range(0 if _bent(relays, found) else plan.doublets):
+    for _ in range(0 if bent(relays, found) else plan.doublets):
         latest, ended = rig.perform(spec_of("doublets", around, plan.doublets_s, gain))
         gain *= 1.0 if ended.completed else _LESS
         if latest.duration_s > longest_s[1] - longest_s[0]:
@@ -269,7 +269,7 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         if not finished.completed and _too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
         around = replace(around, late_s=found.model.delay_s)
-        if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or _bent(done, found)):
+        if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or bent(done, found)):
             break
     if done is None or not _enough(done, plan):
         stopped_near = finished.reason.startswith(machine.STOPPED)

@@ -29,6 +29,8 @@ from tuning.identification.pump_map import (
 
 _KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
 _BENT_SHARE = 0.025  # of the full flow, by which a kink between two levels may be hidden
+# Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the curve
+_BENT_LEAKS, _ABOUT_LEAKS, _SURE = 0.15, 2.0, 3.0
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
 _FINE_EDGE, _TOO_MUCH = 0.002, 0.6  # a jump to more than this share of the leak may be a steep rise through it
@@ -205,8 +207,13 @@ class PumpSurvey:
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
-        for (low, high), off in zip(pairwise(fractions.tolist()), may_bend(fractions, flows), strict=True):
-            if off > _BENT_SHARE * full and high - low > _NEAREST:
+        leak_um_per_s = self.fit.leak_um_per_s
+        for i, off in enumerate(may_bend(fractions, flows).tolist()):
+            low, high = fractions[i : i + 2].tolist()
+            about = flows[i] < _ABOUT_LEAKS * leak_um_per_s < _ABOUT_LEAKS**2 * flows[i + 1]
+            sure = off > _SURE * math.hypot(sigmas[i], sigmas[i + 1])
+            here = about and sure and off > _BENT_LEAKS * leak_um_per_s and high - low > _EDGE
+            if here or (off > _BENT_SHARE * full and high - low > _NEAREST):
                 found.append(_rounded((low + high) / 2))
         return found
 

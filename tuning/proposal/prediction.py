@@ -190,8 +190,33 @@ class Walks:
 # with the configured curve in front of the identified delay, lag, gain and leak, in the identified weather.
 
 _SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
-_SETTLE_S = 30.0
+_SETTLE_S, _START_S = 30.0, 10.0
 _LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # arbitrary: only changes matter
+
+
+class _Driven:
+    """Way of the centre for the commands of a pump, through the identified delay and lag, with unit leak left out."""
+
+    def __init__(self, model: loop_model.PlantModel, pump: PumpConfig, flow_um_per_s: float, dt_s: float) -> None:
+        self._model, self._pump = model, pump
+        self._curve = gas.branch(pump, pump.curve_um_per_s)
+        self._step_s = dt_s / _SUBSTEPS
+        self._tube = deque([flow_um_per_s] * (1 + round(model.dead_time_s / self._step_s)))
+        self._arriving = flow_um_per_s
+        self._running = True
+        self.way_um = 0.0
+
+    def step(self, pump_fraction: float) -> float:
+        """Run one tick; return the way since the start, without the leak's."""
+        pump = self._pump
+        self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
+        flow = self._curve.flow(pump_fraction) if self._running else 0.0
+        follow = -math.expm1(-self._step_s / self._model.lag_s)
+        for _ in range(_SUBSTEPS):
+            self._tube.append(flow)
+            self._arriving += (self._tube.popleft() - self._arriving) * follow
+            self.way_um += self._model.gain * self._arriving * self._step_s
+        return self.way_um
 
 
 class ModelBench:
@@ -208,17 +233,12 @@ class ModelBench:
         seed: int,
         leak_step: tuple[float, float] = (math.inf, 0.0),
     ) -> None:
-        self._model, self._disturbance, self._pump = model, disturbance, pump
-        self._curve = gas.branch(pump, pump.curve_um_per_s)
+        self._model, self._disturbance = model, disturbance
         self._leak_step = leak_step
         self._rng = np.random.default_rng(seed)
         self._dt_s = disturbance.rest.dt_s
-        self._step_s = self._dt_s / _SUBSTEPS
-        flow = model.holding_flow_um_per_s
-        self._tube = deque([flow] * (1 + round(model.dead_time_s / self._step_s)))
-        self._arriving = flow
-        self._running = True
-        self._way_um = 0.0
+        self._driven = _Driven(model, pump, model.holding_flow_um_per_s, self._dt_s)
+        self._leaked_um = 0.0
         self._walks = Walks.of(disturbance)
         self._transition, kicks = self._walks.over(self._dt_s)
         sizes, ways = np.linalg.eigh(kicks)
@@ -229,22 +249,16 @@ class ModelBench:
 
     def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
         """Run one tick. The vent is assumed as during the identification of the leak."""
-        pump = self._pump
-        self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
-        flow = self._curve.flow(pump_fraction) if self._running else 0.0
         at_s, size = self._leak_step
         leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
-        follow = -math.expm1(-self._step_s / self._model.lag_s)
-        for _ in range(_SUBSTEPS):
-            self._tube.append(flow)
-            self._arriving += (self._tube.popleft() - self._arriving) * follow
-            self._way_um += (self._model.gain * self._arriving - leak) * self._step_s
+        self._leaked_um += leak * self._dt_s
+        self._driven.step(pump_fraction)
         self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(self._weather.size)
         return self._read()
 
     def _read(self) -> BenchSample:
         of, walks = self._disturbance, self._walks
-        true_um = self._way_um + float(walks.centre @ self._weather)
+        true_um = self._driven.way_um - self._leaked_um + float(walks.centre @ self._weather)
         self.true_um.append(true_um)
         self._ticks += 1
         laser, pressure, temperature = self._rng.standard_normal(3).tolist()
@@ -255,6 +269,39 @@ class ModelBench:
             else math.nan,
             _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature if of.air else math.nan,
         )
+
+
+class _ReplayBench:
+    """The readings of a record with the motion by its own pump replaced by that for other commands."""
+
+    def __init__(
+        self, record: loop_model.Record, off_um: loop_model.Series, model: loop_model.PlantModel, pump: PumpConfig
+    ) -> None:
+        self.flow_um_per_s = float(record.part(0.0, _START_S).flow_um_per_s.mean())
+        flows = np.append(self.flow_um_per_s, record.flow_um_per_s)
+        own_um = model.gain * loop_model.driven_um(flows, model.dead_time_s, model.lag_s, record.dt_s)[1:]
+        columns = (off_um - own_um, record.ambient_pressure_pa, record.air_temperature_c)
+        self._rest = zip(*(column.tolist() for column in columns), strict=True)
+        self._driven = _Driven(model, pump, self.flow_um_per_s, record.dt_s)
+
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> BenchSample:
+        """Run one tick, with the vent as it was."""
+        way_um = self._driven.step(pump_fraction)
+        rest_um, ambient_pressure_pa, air_temperature_c = next(self._rest)
+        return BenchSample(rest_um + way_um, ambient_pressure_pa, air_temperature_c)
+
+
+def replayed_um(
+    record: loop_model.Record, off_um: loop_model.Series, model: loop_model.PlantModel, loop: LoopConfig,
+    pump: PumpConfig,
+) -> loop_model.Series:  # fmt: skip
+    """What would have been read, less the setpoint, (n - 1,), had another loop held the mirror.
+
+    With the limits of pump and loop: weather that asks for less than no flow is as hard for it as for the one that
+    held. `off_um` (n,) are the record's readings less its setpoint.
+    """
+    bench = _ReplayBench(record, off_um, model, pump)
+    return Rig(bench, loop, pump, bench.flow_um_per_s).hold(record.duration_s - record.dt_s).displacement_um
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ to a second is nearly all motion; the model gives the loop's response to noise:
     var x = var x predicted + mean of (cov(y[i], y[i + l]) seen - predicted),  0 < l dt <= 1 s.
 
 The weather of these ten minutes differs from that of the hour before. So the comparison is with the *old* gains in
-the same weather: that is taken from the same record (`observe`), and the old loop's response to it predicted
-(docs/decisions/78-gains-on-trial.md).
+the same weather: what the pump did not cause in the same record is given to the old loop, with the limits of its
+pump (docs/decisions/78-gains-on-trial.md). In the first minutes the weather of the session is assumed.
 """
 
 import math
@@ -16,22 +16,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.signal import welch
 
-from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.gains_file import GainsFile
 from tuning.identification import disturbance, identify, loop_model
 from tuning.identification.loop_model import Record, Series
-from tuning.proposal.prediction import least_std_um, limited, predict
+from tuning.proposal.prediction import least_std_um, limited, predict, replayed_um
 
 # Time of a stage, and growth that ends the trial there: early on only plain failures, as a minute of weather scatters
 # by a third; at the end the required 10 %.
 STAGES = ((60.0, 2.0), (180.0, 1.5), (300.0, 1.3), (600.0, 1.10))
 SETTLE_LEAST_S, _SETTLE_MOST_S = 20.0, 120.0
 _SETTLE_TIME_CONSTANTS = 4.0  # of the loop's slowest mode: 2 % of the transient from the change of gains is left
-_OBSERVE_LEAST_S = 300.0  # before that, the session's weather is assumed
 MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
 _CLOSE = 1.13  # of the largest growth
 _SEGMENT_S = 20.0
-_RESONANCE_LEAST_S = 180.0  # 17 half-overlapping segments: power to a quarter
+# 17 half-overlapping segments: power to a quarter. Before that the session's weather is assumed: a plant that has
+# changed would look like weather, in which the old gains do no better
+_REPLAY_LEAST_S = 180.0
+_OBSERVE_LEAST_S = 300.0  # of a spectrum of the weather
 _LAGS_S = 1.0  # shorter than the centre's memory (2 s and more), with 50 times as many pairs as one lag
 _POINTS = 3000
 _BAND = 1.3  # width of a band in frequency, as a factor
@@ -43,7 +45,7 @@ class Stage:
 
     time_s: float
     std_um: float  # of the centre, from the record
-    before_um: float  # prediction for the old gains in this weather
+    before_um: float  # of the old gains: as predicted, after five minutes in this very weather
     growth: float  # ratio of the two
     growth_max: float  # the limit
     ms: float  # sensitivity seen; NaN while the record is too short
@@ -77,44 +79,48 @@ class VerificationTrial:
     before: LoopConfig
     after: LoopConfig
     accepted: bool = False  # a person chose these gains knowing that a larger deviation is predicted
+    pump: PumpConfig = PumpConfig()
 
 
-def centre_std_um(off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
+def centre_std_um(
+    off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel, loop: LoopConfig
+) -> float:
     """Standard deviation of the centre without the laser's noise; 0 if the estimate is negative.
 
-    `off_um` (n,) are readings less setpoint; they correct the prediction for this weather.
+    `off_um` (n,) are readings less setpoint under `loop`; they correct the prediction for this weather.
     """
     dt_s = weather.rest.dt_s
     off = off_um - off_um.mean()
     lags = np.arange(1, round(_LAGS_S / dt_s) + 1)
     seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
-    gains = loop_model.Gains.of(trial.after)
+    gains = loop_model.Gains.of(loop)
     w = loop_model.frequencies(dt_s, _POINTS)
-    model, moving = limited(gains, trial.model, weather, trial.after, w)
+    model, moving = limited(gains, trial.model, weather, loop, w)
     sensitivity = np.abs(1 / (1 + loop_model.loop_response(gains, model, w, dt_s))) ** 2
     noise = weather.rest.white_psd
     coloured = sensitivity * (moving + noise) - noise
     expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
-    predicted_um = predict(gains, trial.model, weather, trial.after).std_um
+    predicted_um = predict(gains, trial.model, weather, loop).std_um
     return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
 
 
-def seen_sensitivity(off_um: Series, trial: VerificationTrial) -> float:
+def seen_sensitivity(off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel) -> float:
     """Largest sensitivity, from the excess of the spectrum over the model's prediction.
 
     Increased gain or delay of the plant shows as a peak near the crossover. The level of the weather does not
     matter: only the shape is compared, each band with the median band.
     """
-    gains, dt_s = loop_model.Gains.of(trial.after), trial.weather.rest.dt_s
+    gains, dt_s = loop_model.Gains.of(trial.after), weather.rest.dt_s
     frequency_hz, power = welch(off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant")
     w: Series = 2 * np.pi * frequency_hz
     fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
     used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
     w, power = w[used], power[used]
-    model, moving = limited(gains, trial.model, trial.weather, trial.after, w)
+    model, moving = limited(gains, trial.model, weather, trial.after, w)
     s = np.abs(1 / (1 + loop_model.loop_response(gains, model, w, dt_s))) ** 2
-    excess = power / (s * (moving + trial.weather.rest.white_psd))
-    bands = np.floor(np.log(w / w[0]) / math.log(_BAND)).astype(int)
+    peak = s >= min(1.0, s.max())  # slower motion that exceeds the prediction is weather, or a limit of the pump
+    excess, bands = power[peak] / (s * (moving + weather.rest.white_psd))[peak], w[peak]
+    bands = np.floor(np.log(bands / w[0]) / math.log(_BAND)).astype(int)
     means = np.array([excess[bands == band].mean() for band in np.unique(bands)])
     model_ms = loop_model.margins(gains, trial.model, dt_s).ms
     return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
@@ -124,16 +130,21 @@ def look(record: Record, setpoint_um: Series, trial: VerificationTrial, growth_m
     """Judge the record so far, comparing the centre with each sample's setpoint."""
     off_um = record.filled_displacement_um() - setpoint_um
     weather = trial.weather
+    replayed = record.duration_s >= _REPLAY_LEAST_S
     if record.duration_s >= _OBSERVE_LEAST_S:
         weather = disturbance.observe(record, trial.model, trial.after)
-    std_um = centre_std_um(off_um, trial, weather)
+    std_um = centre_std_um(off_um, trial, weather, trial.after)
     before_um, after_um = (
         predict(loop_model.Gains.of(loop), trial.model, weather, loop).std_um for loop in (trial.before, trial.after)
     )
+    predicted_growth = after_um / before_um
+    if replayed:
+        would_um = replayed_um(record, off_um, trial.model, trial.before, trial.pump)
+        before_um = centre_std_um(would_um, trial, weather, trial.before)
     if trial.accepted:
-        growth_max *= max(1.0, after_um / before_um)
+        growth_max *= max(1.0, predicted_growth)
     growth = std_um / before_um
-    ms = seen_sensitivity(off_um, trial) if record.duration_s >= _RESONANCE_LEAST_S else math.nan
+    ms = seen_sensitivity(off_um, trial, weather) if replayed else math.nan
     reason = ""
     if growth > growth_max:
         reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the previous gains"
@@ -174,7 +185,7 @@ def health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFil
     model = made.plant.model
     weather = disturbance.observe(record, model, loop)
     off_um = record.filled_displacement_um() - setpoint_um
-    std_um = centre_std_um(off_um, VerificationTrial(model, weather, loop, loop), weather)
+    std_um = centre_std_um(off_um, VerificationTrial(model, weather, loop, loop), weather, loop)
     least_um = least_std_um(model, weather, loop)
     designed = predict(loop_model.Gains.of(loop), model, weather, loop).std_um / least_um
     gain, gain_sigma = _natural_gain(record, loop)
