@@ -88,6 +88,7 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     while held and (steps := survey.steps()):
         if flow_um_per_s := gas.PumpCurve(rig.pump).flow(survey.holding):  # none, on a curve far from the true
             around = replace(around, holding_flow_um_per_s=flow_um_per_s)
+        around = replace(around, late_s=max(around.late_s, survey.fit.delay_s + survey.fit.lag_s))
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         run = run_of(rows, rig.dt_s)

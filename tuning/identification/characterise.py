@@ -25,6 +25,7 @@ _JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
 _P_MIN = 1e-4
 _BENT_SIGMAS = 5.0  # sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
 _BENT_SHARE = 0.2  # of k; the margins tolerate less
+_STRONG = 1.5  # k of a pump whose least flow may be more than the leak: it swings with any gains
 _WORSE_MAX = 1.5  # innovation on new data relative to the fit
 _TOO_STRONG, _CERTAIN_SIGMAS = 1.25, 3.0  # k of a pump that stopped its relays
 
@@ -99,7 +100,9 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
     refused.extend(bent(record, identified))
     if identified.independence_p < _P_MIN:
         degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {MAP_THE_PUMP}")
-    if identified.whiteness_p < _P_MIN:
+    if identified.whiteness_p < _P_MIN and model.gain > _STRONG:
+        refused.append(f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?): {MAP_THE_PUMP}")
+    elif identified.whiteness_p < _P_MIN:
         degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
     return refused, degraded
 
