@@ -125,6 +125,18 @@ def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
         assert given == pytest.approx(flow, abs=0.01 * 7.0)
 
 
+@pytest.mark.parametrize("wanted", [0.0, 0.3])
+def test_a_falling_branch_that_ends_in_the_middle_can_be_stopped(wanted: float) -> None:
+    """The pump ran on at its first command, where the branch gives 1.3 um/s: the mirror rose by 62 um."""
+    table = {"curve_fraction": (0.086, 0.12, 1.0), "curve_um_per_s": (0.001, 1.8, 6.3)}
+    pump = {"start_fraction": 0.0, "stall_fraction": 0.0, "curve_falling_um_per_s": (1.3, 2.0, 6.3)}
+    curve = PumpCurve(PumpConfig.model_validate(table | pump))
+    for _ in range(20):
+        curve.command(2.0, DT_S)
+    assert curve.least_flow_um_per_s == pytest.approx(1.3)
+    assert [curve.command(wanted, DT_S) for _ in range(3)] == [0.0] * 3
+
+
 def test_nothing_is_commanded_beyond_the_last_point() -> None:
     curve = PumpCurve(PumpConfig(curve_fraction=(0.2, 0.7), curve_um_per_s=(0.5, 4.0)))
     assert curve.command(99.0, DT_S) == 0.7

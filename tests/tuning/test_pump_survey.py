@@ -309,6 +309,14 @@ def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(flows: li
     assert (0.053 in survey_of([0.045, 0.061, 0.2], flows, 0.57)._finer(True)) == finer
 
 
+@pytest.mark.parametrize(("leak", "finer"), [(0.7, True), (12.0, False)])
+def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None:
+    """A dead zone ends at 0.3, of a pump 19 times the leak: 2 % of its full flow were hidden, and k was 1.2."""
+    survey = survey_of([0.242, 0.322, 0.422, 0.567, 1.0], [0.0, 0.397, 2.275, 4.97, 13.1], leak)
+    survey._branches[True].sigmas[1:] = 0.02
+    assert (0.282 in survey._finer(True)) == finer
+
+
 @pytest.mark.parametrize(("last", "up"), [(1.0, 0.55), (3.5, 0.4)])
 def test_a_weak_pump_gets_more_than_the_largest_command_so_far(last: float, up: float) -> None:
     """Which did not lift the mirror: it sank until its guard ended the round, nine times."""
@@ -373,10 +381,11 @@ def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back
 
 @pytest.mark.parametrize(
     ("seen", "lasted_s", "kept"),
-    [([(1.1, 0.02, False)], [120.0], True), ([(2.5, 0.5, True), (1.2, 0.2, False)], [120.0, 240.0], True),
+    [([(1.1, 0.02, False)], [120.0], True), ([(2.5, 0.5, True), (1.2, 0.15, False)], [120.0, 240.0], True),
      ([(0.7, 0.05, False), (1.0, 0.05, False)], [120.0, 240.0], True),
      ([(2.5, 0.05, False)] * 3, [120.0, 240.0, 480.0], False),
-     ([(2.5, 0.5, True)] * 3, [120.0, 240.0, 480.0], False)],
+     ([(2.5, 0.5, True)] * 3, [120.0, 240.0, 480.0], False),
+     ([(0.7, 0.3, False)] * 3, [120.0, 240.0, 480.0], True)],
 )  # fmt: skip
 def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     monkeypatch: pytest.MonkeyPatch, seen: list[tuple[float, float, bool]], lasted_s: list[float], kept: bool
@@ -391,16 +400,12 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     monkeypatch.setattr(pump_trial, "_returned", lambda rig: True)
     monkeypatch.setattr(pump_trial.machine, "room", lambda around: None)
     monkeypatch.setattr(pump_trial.characterise, "spec_of", lambda kind, around, seconds: seconds)
-    unknown = {gain: told for gain, _, told in seen}
+    bent = {gain: told for gain, _, told in seen}
     monkeypatch.setattr(
         pump_trial.identify, "identify",
         lambda at: SimpleNamespace(model=SimpleNamespace(gain=at[0]), sigma=SimpleNamespace(gain=at[1])),
     )  # fmt: skip
-    monkeypatch.setattr(
-        pump_trial.characterise,
-        "judge",
-        lambda record, found: SimpleNamespace(pump_unknown=unknown[found.model.gain]),
-    )
+    monkeypatch.setattr(pump_trial.characterise, "bent", lambda record, found: ["bent"] * bent[found.model.gain])
     if kept:
         assert pump_trial._checked(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
     else:

@@ -16,14 +16,16 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions import folder as plain
+from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
-from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
-from tuning.identification.loop_model import PlantModel, Record, load_record, save_record
+from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain, observe
+from tuning.identification.loop_model import Gains, PlantModel, Record, load_record, save_record
 from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
-from tuning.proposal.prediction import ModelBench
+from tuning.opening import TwinHold
+from tuning.proposal.prediction import ModelBench, predict
 from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
-from tuning.rig import Rig
+from tuning.rig import HoldRig, Rig
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
 WEATHER = DisturbanceModel(Noise(1.0, 0.01, 0.01, 12.0, 0.02), None, None)
@@ -85,6 +87,35 @@ def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     stage = look(record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, loop, loop), 100.0)
     assert stage.ms > 2.0
     assert "less margin than designed" in stage.reason
+
+
+STORM_PUMP = PumpConfig(start_fraction=0, stall_fraction=0, curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 5.3))
+STORM_MODEL = PlantModel(1.0, 0.4, 0.3, 0.2)
+
+
+def in_a_storm(loop: LoopConfig) -> tuple[Record, float]:
+    """Ten minutes on a tight mirror of the second world, whose weather asks for less than no flow; true deviation."""
+    plant = ForeignPlant(ForeignPump("straight", 5.3, 0.4, 0.3), 7, 3.0, 0.2, True, 0.5, False)
+    config = foreign_config(rate_hz=20.0).model_copy(update={"loop": loop, "pump": STORM_PUMP})
+    link = TwinHold(config, bench=foreign_bench(plant))
+    rig = HoldRig(link, "tester")
+    rig.hold(100.0)
+    record = rig.hold(600.0)
+    return record, float(np.std([row.truth_displacement_um for row in link.rows[-len(record) :]]))
+
+
+def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> None:
+    """It asks for less than no flow for minutes: its spectrum says less than half of what the gains before had."""
+    before = foreign_config(rate_hz=20.0, feedforward_barometer=False, feedforward_temperature=False).loop
+    after = before.model_copy(update={"kp_per_s": 0.35, "ti_s": 20.0})
+    record, after_um = in_a_storm(after)
+    _, before_um = in_a_storm(before)
+    weather = observe(record, STORM_MODEL, after)
+    trial = VerificationTrial(STORM_MODEL, weather, before, after, pump=STORM_PUMP)
+    stage = look(record, np.zeros(len(record)), trial, 1.1)
+    assert stage.std_um == pytest.approx(after_um, rel=0.05)
+    assert stage.before_um == pytest.approx(before_um, rel=0.05)
+    assert predict(Gains.of(before), STORM_MODEL, weather, before).std_um < 0.5 * before_um
 
 
 def test_a_setpoint_that_moved_is_no_deviation() -> None:

@@ -85,6 +85,16 @@ def test_a_pump_that_does_nothing_is_named() -> None:
     assert "run `tune pump`" in found.reasons[0]
 
 
+@pytest.mark.parametrize(("gain", "verdict"), [(2.6, "refused"), (0.6, "degraded")])
+def test_only_a_strong_pump_beside_which_something_swings_is_mapped(gain: float, verdict: str) -> None:
+    """One that starts with more than the leak can only pulse: no gains hold it without swinging."""
+    whole = record(replace(TRUTH, gain=gain), laser_um=0.1)
+    swing_um = 0.1 * np.sin(2 * np.pi * 1.3 * whole.dt_s * np.arange(len(whole)))
+    found = judge(whole, identify(replace(whole, displacement_um=whole.displacement_um + swing_um)))
+    assert (found.verdict, found.pump_unknown) == (verdict, verdict == "refused")
+    assert any("coloured" in reason for reason in found.reasons)
+
+
 def test_a_blinking_laser_is_refused() -> None:
     whole = record(TRUTH)
     reading = whole.displacement_um.copy()

@@ -11,7 +11,7 @@ pump (docs/decisions/78-gains-on-trial.md). In the first minutes the weather of 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.signal import welch
@@ -79,7 +79,7 @@ class VerificationTrial:
     before: LoopConfig
     after: LoopConfig
     accepted: bool = False  # a person chose these gains knowing that a larger deviation is predicted
-    pump: PumpConfig = PumpConfig()
+    pump: PumpConfig = field(default_factory=PumpConfig)
 
 
 def centre_std_um(
