@@ -178,6 +178,7 @@ def test_a_close_verification_goes_on_for_as_long_again(
     left, told = list(growths), []
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
+        pump=PumpConfig(),
         dt_s=1.0, set_gains=lambda *given: None, keep=lambda: told.append("keep"), hold=lambda seconds: None,
         hold_about=lambda seconds: (held, np.zeros(round(seconds))),
     )  # fmt: skip

@@ -200,7 +200,8 @@ def first_jump(branch: Branch, full: float) -> tuple[float, float] | None:
         return None
     low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
     before, after = flows[clear[0] - 1 : clear[0] + 1] / full
-    return (low, high) if before < _NONE_SHARE and after > JUMP_SHARE and high - low <= _EDGE_MOST else None
+    # what comes before is not clear: noise may be more than none
+    return (low, high) if before < JUMP_SHARE < after - before and high - low <= _EDGE_MOST else None
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:

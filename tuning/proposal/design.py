@@ -159,6 +159,8 @@ def candidate(
     """One row."""
     found = loop_model.margins(gains, model, disturbance.rest.dt_s)
     predicted = prediction.predict(gains, model, disturbance, loop) if found.stable else None
+    if predicted is not None and predicted.flow_std_um_per_s > loop.flow_max_um_per_s:
+        predicted = replace(predicted, std_um=math.nan)  # the pump only switches: no linear loop describes that
     ratio = (
         predicted.std_um / prediction.least_std_um(model, disturbance, loop) if predicted is not None else math.inf
     )
@@ -297,7 +299,7 @@ def against(row: Candidate, present: Candidate | None) -> str:
     worse: list[str] = []
     for name, word in _WORDS.items():
         now, then = getattr(present.figures, name), getattr(row.figures, name)
-        if not math.isclose(now, then, rel_tol=_ALIKE):
+        if not math.isnan(now - then) and not math.isclose(now, then, rel_tol=_ALIKE):
             factor = f" x {then / now:.2f}" if 0 < now < math.inf and then < math.inf else ""
             (better if then < now else worse).append(word + factor)
     return "; ".join(f"{word}: {', '.join(said)}" for word, said in (("better", better), ("worse", worse)) if said)
@@ -309,6 +311,8 @@ def refusal(row: Candidate) -> str:
         return "unstable"
     if row.margins.ms > MS_MAX:
         return f"Ms {row.margins.ms:.2f}, the limit is {MS_MAX:g}"
+    if math.isnan(row.predicted.std_um):
+        return "the pump would only switch"
     try:
         row.gains.applied_to(LoopConfig())
     except ValidationError:
@@ -324,11 +328,10 @@ def _gains(row: Candidate) -> tuple[str, ...]:
 def _figures(row: Candidate) -> list[str]:
     if row.predicted is None:
         return ["unstable", "", "", ""]
-    found = [f"{getattr(row.figures, name):.{digits}f}" for name, digits in _DIGITS.items()]
-    if row.sigma is None:
-        return found
-    sigmas = [f"{getattr(row.sigma, name):.{digits}f}" for name, digits in _DIGITS.items()]
-    return [f"{value} +- {sigma}" for value, sigma in zip(found, sigmas, strict=True)]
+    found = {name: f"{getattr(row.figures, name):.{digits}f}" for name, digits in _DIGITS.items()}
+    if row.sigma is not None:
+        found = {name: f"{value} +- {getattr(row.sigma, name):.{_DIGITS[name]}f}" for name, value in found.items()}
+    return [value if not value.startswith("nan") else "not known" for value in found.values()]
 
 
 def _margins(row: Candidate) -> tuple[str, ...]:
