@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from multiprocessing import Pool
 from pathlib import Path
 from typing import Any
@@ -147,7 +148,7 @@ def least_std_um(bench: DrawnBench, weather_seed: int) -> float:
     return float((target[half:] - features[half:] @ weights).std())
 
 
-def examined(bench: DrawnBench) -> dict[str, Any]:
+def examined(bench: DrawnBench, short: bool = False) -> dict[str, Any]:
     """Figures of one bench; a refusal or an error is a figure as well. What a refusal asks for is done."""
     found: dict[str, Any] = asdict(bench) | {"least_um": least_std_um(bench, 3), "obeyed": []}
     config, limit_um = bench.config(), LIMIT_UM
@@ -158,9 +159,9 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
         config = config.model_copy(update={"loop": config.loop.model_copy(update=slower)})
         found |= _held("default", bench, config)
     while "default_error" not in found:
-        found |= _session(bench, config, limit_um) | {"limit_um": limit_um}
+        found |= _session(bench, config, limit_um, short) | {"limit_um": limit_um}
         asked = _ASKED.search(found.get("refused", ""))
-        if asked is None or len(found["obeyed"]) == OBEYED_MOST:
+        if short or asked is None or len(found["obeyed"]) == OBEYED_MOST:
             break
         found["obeyed"].append(found.pop("refused"))
         if asked["bleed"]:
@@ -171,7 +172,7 @@ def examined(bench: DrawnBench) -> dict[str, Any]:
     return found
 
 
-def _session(bench: DrawnBench, config: Config, limit_um: float) -> dict[str, Any]:
+def _session(bench: DrawnBench, config: Config, limit_um: float, short: bool) -> dict[str, Any]:
     """Figures of a whole session and, if gains were kept, of a hold with them."""
     hold: list[TwinHold] = []
 
@@ -188,7 +189,7 @@ def _session(bench: DrawnBench, config: Config, limit_um: float) -> dict[str, An
         told = io.StringIO()
         try:
             with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
-                found["exit"] = command.run_session(_options(config, Path(folder), limit_um))
+                found["exit"] = command.run_session(_options(config, Path(folder), limit_um, short))
         except CommandError as error:
             found |= {"exit": int(error.exit), "refused": "; ".join(error.lines)}
         except Exception as error:
@@ -203,11 +204,11 @@ def _session(bench: DrawnBench, config: Config, limit_um: float) -> dict[str, An
     return found
 
 
-def _options(config: Config, logs: Path, limit_um: float) -> TuneOptions:
+def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -> TuneOptions:
     return TuneOptions(
         config=config, twin=True, where=Where(), logs=logs, session=None, name="bench", author="benchmark",
-        reason="drawn bench", limit_um=limit_um, observe_s=session.OBSERVE_S, verify_s=600.0, take_over=False,
-        yes=True, choose="", json=False,
+        reason="drawn bench", limit_um=limit_um, observe_s=session.OBSERVE_S, verify_s=300.0 if short else 600.0,
+        take_over=False, yes=not short, choose="same-load" if short else "", json=False, short=short,
     )  # fmt: skip
 
 
@@ -242,9 +243,9 @@ def _held(name: str, bench: DrawnBench, config: Config) -> dict[str, Any]:
     return {f"{name}_um": float(true_um.std()), f"{name}_held": float(held)}
 
 
-def _one(seed: int) -> dict[str, Any]:
+def _one(seed: int, short: bool = False) -> dict[str, Any]:
     try:
-        return examined(drawn(seed))
+        return examined(drawn(seed), short)
     except Exception as error:  # one bench that fails must not end the others
         return asdict(drawn(seed)) | {"crashed": f"{type(error).__name__}: {error}"}
 
@@ -325,12 +326,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--file", type=Path, default=DEFAULT_FILE)
+    parser.add_argument("--short", action="store_true")
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)
     rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
     known = {row["seed"] for row in rows}
     with Pool(given.processes) as pool, given.file.open("a", encoding="utf-8") as file:
-        for row in pool.imap_unordered(_one, sorted({*range(given.first, given.first + given.benches)} - known)):
+        missing = sorted({*range(given.first, given.first + given.benches)} - known)
+        for row in pool.imap_unordered(partial(_one, short=given.short), missing):
             rows.append(row)
             file.write(json.dumps(row) + "\n")
             file.flush()

@@ -236,6 +236,8 @@ def choose(session: folder.SessionFolder, name: str) -> None:
     """Put a candidate into `gains.toml`. Raises InputError if it is unknown or must not be applied."""
     rows, now = offered(session)
     known = {row.name: row for row in rows if row.name != design.PRESENT}
+    if name == design.SAME_LOAD and name not in known:
+        name = design.NAMES[0]  # answers a step of the leak no worse
     if name not in known:
         raise errors.InputError(f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}")
     row = known[name]

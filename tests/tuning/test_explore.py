@@ -148,7 +148,7 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
     folder.write(opened.file("applied.json"), {})
 
     class Lost:
-        dt_s, told = 0.02, 0
+        dt_s, told, pump = 0.02, 0, PumpConfig()
 
         def set_gains(self, *given: object) -> None:
             self.told += 1

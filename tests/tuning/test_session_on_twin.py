@@ -489,6 +489,17 @@ def test_no_answer_applies_nothing(
     assert ("nothing is applied; `membrane-ctrl tune apply" in said) == (code == Exit.DONE)
 
 
+def test_the_proposal_is_the_same_load_where_it_answers_a_load_no_worse(
+    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`hold --autotune` asks for `same-load`, which is designed only where the proposal answers a load worse."""
+    rows = [row for row in session.offered(done)[0] if row.name != "same-load"]
+    opened = open_session(Path(shutil.copytree(done.path, tmp_path / "copy")))
+    monkeypatch.setattr(session, "offered", lambda folder: (tuple(rows), rows[0]))
+    session.choose(opened, "same-load")
+    assert load_gains(opened.file("gains.toml")).candidate == "least-variance"
+
+
 @pytest.mark.parametrize("name", ["fast", "ziegler-nichols", "present"])
 def test_a_refused_name_applies_nothing(
     done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
