@@ -243,8 +243,7 @@ def choose(session: folder.SessionFolder, name: str) -> None:
     if why := design.refusal(row):
         raise errors.InputError(f"{name}: is not applied: {why}")
     assert row.predicted is not None  # else refused
-    path = session.file("gains.toml")
-    gains = load_gains(path)
+    gains = load_gains(path := session.file("gains.toml"))
     chosen = {"candidate": row.name, "predicted_std_um": row.predicted.std_um}
     save_gains(path, gains.model_copy(update={**chosen, "loop": row.gains.applied_to(gains.loop)}))
     if row is not now and session.done("preview"):
