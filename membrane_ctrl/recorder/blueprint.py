@@ -110,19 +110,27 @@ def _overview(config: Config) -> rrb.Vertical:
 _TICKS = "every tick around events, else one a second"
 
 
+def learned(config: Config) -> dict[str, tuple[str, ...]]:
+    """Plots of what a loop of this configuration learns: the paths of each, by name."""
+    found: dict[str, tuple[str, ...]] = {}
+    if config.pump.probe_um:
+        found["Pump against its curve"] = (streams.PUMP.path,)
+    if config.estimator.process_value != "laser":
+        found["Estimate of the centre, 1 sigma, µm"] = ("/estimate/sigma",)
+        found["Innovations in standard deviations"] = ("/estimate/innovations", "/estimate/optics_share")
+    return found
+
+
 def _loop(config: Config) -> rrb.Vertical:
-    learned = [_plot("Pump against its curve", streams.PUMP.path)] if config.pump.probe_um else []
-    if config.estimator.process_value == "estimate":
-        learned.append(_plot("Estimate of the centre, 1 sigma, µm", "/estimate/sigma"))
-        learned.append(_plot("Innovations in standard deviations", "/estimate/innovations", "/estimate/optics_share"))
+    further = [_plot(name, *paths) for name, paths in learned(config).items()]
     return rrb.Vertical(
         _around_band(config, f"Error and band, {_TICKS}, µm", "/loop/error", "/truth/error"),
         _plot("Setpoint, reading and true centre, µm", "/loop/position", "/truth/displacement"),
         _plot("P, I, D and feed-forward, µm/s", "/loop/terms"),
         _plot("Flow wanted, flow and leak, µm/s", "/loop/flow"),
         _plot("Pump and vent", "/pump/drive"),
-        *learned,
-        row_shares=[3, 2, 2, 2, 2, *(2 for _ in learned)],
+        *further,
+        row_shares=[3, 2, 2, 2, 2, *(2 for _ in further)],
         name="Loop",
     )
 

@@ -11,8 +11,10 @@ import pytest
 from rerun.chunk import RrdReader
 
 from benchmarks.nights import Planted
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.recorder.blueprint import learned
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.viewer.blueprints import labels_of
+from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint, labels_of
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.run_files import shapes
 from tests.support.review_runs import set_summary, written
@@ -45,7 +47,9 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for at_s, told in (
             (200.0, {"kind": "command", "command": "pause"}),
             (210.0, {"kind": "command", "command": "hold", "refused": "no"}),
+            (250.0, {"kind": "pump", "scale": 1.05, "sigma": 0.1, "correction": 1.0}),
             (300.0, {"kind": "fault", "name": "laser_lost", "cause": "no reading", "remedy": "clean it"}),
+            (850.0, {"kind": "pump", "scale": 0.82, "sigma": 0.04, "correction": 0.95}),
         ):
             file.write(json.dumps({"mono_s": at_s, **told}) + "\n")
     return folder
@@ -92,6 +96,23 @@ def test_lines_stand_where_something_happened_and_are_named_with_its_size(night:
     assert layer["/state/controller"]["StateChange:state"] == [["hold"], [None]]  # another run may last longer
     (fault,) = (text for (text,) in layer["/events"]["TextLog:text"] if "Fault" in text)
     assert "Do: clean it" in fault
+
+
+def test_what_was_learned_of_the_pump_is_drawn_with_its_error(night: Path, tmp_path: Path) -> None:
+    """The recording's own layout had it, a review did not."""
+    pump = reviewed([night], tmp_path / "r.rrd")["/pump/scale"]
+    assert pump["Measurements:values"] == [[1.05, 1.0], [0.82, 0.95]]
+    assert np.array(pump["Measurements:variances"]) == pytest.approx(np.array([[0.01, 0.0], [0.0016, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("config", "plots"),
+    [({}, 0), ({"pump": {"probe_um": 0.1}}, 1), ({"estimator": {"process_value": "estimate"}}, 2)],
+)
+def test_the_loop_s_tab_has_what_the_loop_learns(config: dict[str, dict[str, Any]], plots: int) -> None:
+    assert len(learned(Config.model_validate(config))) == plots
+    tab = ReviewBlueprint(("",), "utc", None, Config.model_validate(config))._loop()
+    assert len(list(tab.contents)) == 5 + plots
 
 
 def test_maps_are_those_of_the_cycles_in_stated_colours(night: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import AbsoluteTimeRange
 from rerun.blueprint.encodings import TimelineColumn
 
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.recorder import blueprint
 from membrane_ctrl.review.viewer.layer import prefix_of
 
@@ -31,14 +32,14 @@ class ReviewBlueprint:
         `utc`, or `run_time` for runs aligned at a moment of each.
     span_ns : tuple or None
         Time range to show, on that timeline; None: everything.
-    band_um : float
-        The error plots span three bands.
+    config : Config
+        Of the first run; the error plots span three of its bands.
     """
 
     labels: Sequence[str]
     timeline: str
     span_ns: tuple[int, int] | None
-    band_um: float
+    config: Config
 
     def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
         """The blueprint, with some of `TABS`, `tab` selected."""
@@ -76,7 +77,8 @@ class ReviewBlueprint:
 
     def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
         """A plot of the error, with lines where something happened: these would stretch an axis of no fixed span."""
-        span_um = (-3 * self.band_um, 3 * self.band_um)
+        band_um = self.config.limits.band_um
+        span_um = (-3 * band_um, 3 * band_um)
         return self._plot(name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um)
 
     def _error(self) -> rrb.TimeSeriesView:
@@ -130,13 +132,15 @@ class ReviewBlueprint:
         )
 
     def _loop(self) -> rrb.Vertical:
+        further = [self._plot(name, *paths) for name, paths in blueprint.learned(self.config).items()]
         return rrb.Vertical(
             self._around_band("Error, each tick, µm (shown for short runs, or with --from and --to)", "/loop/error"),
             self._plot("Setpoint, reading, true centre, µm", "/loop/position", "/truth/displacement"),
             self._plot("P, I, D, feed-forward, µm/s", "/loop/terms"),
             self._plot("Flow and leak, µm/s", "/loop/flow"),
             self._plot("Pump and vent", "/pump/drive"),
-            row_shares=[3, 2, 2, 2, 2],
+            *further,
+            row_shares=[3, 2, 2, 2, 2, *(2 for _ in further)],
             name="loop",
         )
 

@@ -170,7 +170,7 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
     timeline = "utc" if by_clock else "run_time"
     zero_ns = round(1e9 * runs[0].origin_utc.timestamp()) if by_clock else -round(1e9 * zeros_s[0])
     shown_ns = None if span_s is None else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
-    blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config.limits.band_um)
+    blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
     if shown_ns is None:
@@ -322,7 +322,7 @@ class RunCatalogue:
         hidden = [Column(f"property:RecordingInfo:{name}", visible=False) for name in ("name", "start_time")]
         started = SortBy("property:run:started_utc", direction="Descending")
         table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
-        coarse = blueprints.ReviewBlueprint(("",), "utc", None, Config().limits.band_um)
+        coarse = blueprints.ReviewBlueprint(("",), "utc", None, Config())
         runs = coarse.made(tabs=blueprints.COARSE_TABS)
         table.save(APPLICATION, self._folder / "table.rbl")
         runs.save(APPLICATION, self._folder / "run.rbl")

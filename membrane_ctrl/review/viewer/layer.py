@@ -170,6 +170,12 @@ class Layer:
         for stream, time_s, values in streams.mark_lines([{**each.line, "mono_s": each.mono_s} for each in run.log]):
             self._style(stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True)
             self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
+        pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
+        if pump:
+            values = np.array([(told.scale, told.correction) for _, told in pump])
+            variances = np.array([(told.sigma**2, 0.0) for _, told in pump])
+            lines = [(line.name, line.colour) for line in streams.PUMP.lines]
+            self._measured(streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances)
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
             texts = [f"{f.kind}, {_size(f.size, f.unit)} (confidence {f.confidence:.3f})" for f in seen]
