@@ -59,9 +59,9 @@ class TuneOptions:
 
     @property
     def stages(self) -> tuple[tuple[float, float], ...]:
-        """Stages of the verification that fit in the time available."""
-        share = self.verify_s / STAGES[-1][0]
-        return tuple((share * until_s, growth) for until_s, growth in STAGES)
+        """Stages of the verification that fit in the time available; none earlier: one gust is half of 30 s."""
+        early = tuple(stage for stage in STAGES[:-1] if stage[0] < self.verify_s)
+        return (*early, (self.verify_s, STAGES[-1][1]))
 
 
 def author_name() -> str:
