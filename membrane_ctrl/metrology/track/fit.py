@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.optics import kernels
-from membrane_ctrl.metrology.optics.compiled import kernel, split
+from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.metrology.track.scene import CrossedScene
@@ -43,13 +43,13 @@ _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now th
 
 
 @kernel
-def _model(base, turn, shifts, maps, response, edge, seen, reach, out, start, stop):  # type: ignore[no-untyped-def]
+def _model(base, turn, shifts, maps, response, edge, seen, reach, out):  # type: ignore[no-untyped-def]
     """Rows of `out` (7, n): e w r times dI by phi_x, by phi_y, by A, by B_x, by B_y; residual r, Tukey's weight w.
 
     `maps` (3, n) are level and swings, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves a bin out.
     """
     bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
-    for p in range(start, stop):
+    for p in range(seen.size):
         x = base[0, p] + turn[0, p] + shifts[0]
         y = base[1, p] + turn[1, p] + shifts[1]
         cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
@@ -162,13 +162,9 @@ class FrameFitter:
         self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        turn = self._turned(shape, light)
-
-        def run(start: int, stop: int) -> None:
-            fixed = (self._base, turn, np.array(shifts_rad, np.float32), self._maps, self.scene.response)
-            _model(*fixed, self.scene.edge, seen_adu, reach, self._out, start, stop)
-
-        split(run, self.scene.index.size)
+        fixed = (self._base, self._turned(shape, light), np.array(shifts_rad, np.float32), self._maps)
+        # not split: waking a thread takes as long, and longer where the other core has work
+        _model(*fixed, self.scene.response, self.scene.edge, seen_adu, reach, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
         """Phases (2, n) of a surface beyond those of the one that was traced last; the maps follow the light."""

@@ -77,6 +77,7 @@ class Tracker:
     def _begin(self, scene: CrossedScene, shape: surface.Surface) -> None:
         """Start from a scene and a surface, with the light of the scene."""
         none = np.zeros(scene.index.size, np.float32)
+        self._swing_adu = float(np.median(scene.light_adu[1]))
         self._fitter = FrameFitter(scene, self._fitter.jacobian)
         self._last = FrameFit(shape, np.zeros((3, 36)), none, none, True)
         self._scale_adu, self._light = 0.0, math.nan
@@ -195,7 +196,7 @@ class Tracker:
         if rejected is not None:
             return tracked.rejected_frame(time_s, rejected.reason)
         fit = self._fitted(seen, shifts_rad, light, saturated | self._squares.bins(covered), displacement_um)
-        swing_adu = float(np.median(self._fitter.scene.light_adu[1])) * light
+        swing_adu = self._swing_adu * light
         rest, far = self._scale_of(fit) / swing_adu, np.abs(fit.residual_adu) > _FAR_OFF * swing_adu
         out = float(np.mean((far & (fit.weights == 0))[~saturated & ~self._squares.bins(covered)]))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
@@ -268,8 +269,7 @@ class Tracker:
         return max(1.4826 * float(np.median(np.abs(fit.residual_adu[::3]))), self._noise_adu)
 
     def _lost(self, fit: FrameFit) -> bool:
-        swing = float(np.median(self._fitter.scene.light_adu[1]))
-        return not fit.converged or self._scale_of(fit) > _REST_REJECTED * swing
+        return not fit.converged or self._scale_of(fit) > _REST_REJECTED * self._swing_adu
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
@@ -329,7 +329,7 @@ class Tracker:
             reason=fault.reason,
             rest_share=rest,
             used_share=float(np.mean(fit.weights > 0)),
-            swing_adu=float(np.median(self._fitter.scene.light_adu[1])) * (1 + float(fit.light[1, 0])),
+            swing_adu=self._swing_adu * (1 + float(fit.light[1, 0])),
             lost=fault.lost,
         )
 
