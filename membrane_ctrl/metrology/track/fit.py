@@ -162,9 +162,10 @@ class FrameFitter:
         self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        fixed = (self._base, self._turned(shape, light), np.array(shifts_rad, np.float32), self._maps)
+        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)  # may trace anew
+        fixed = (self._base, turn, shifts, self._maps, self.scene.response, self.scene.edge)
         # not split: waking a thread takes as long, and longer where the other core has work
-        _model(*fixed, self.scene.response, self.scene.edge, seen_adu, reach, self._out)
+        _model(*fixed, seen_adu, reach, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
         """Phases (2, n) of a surface beyond those of the one that was traced last; the maps follow the light."""
