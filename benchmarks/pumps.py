@@ -122,7 +122,7 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
     link = TwinHold(second_world.foreign_config(rate_hz=RATE_HZ), bench=second_world.foreign_bench(plant))
     rig = HoldRig(link, "benchmark")
     rig.hold(SETTLED_S)
-    rig.set_gains(rig.loop.model_copy(update=pump_trial._CAUTIOUS), "pump map", 3600.0)
+    pump_trial._calmed(rig, limit_um)
     before, made = len(link.rows), list[PumpSurvey]()
 
     def survey(*given: float) -> PumpSurvey:

@@ -8,7 +8,7 @@ import numpy as np
 
 from membrane_ctrl.config import schema
 from membrane_ctrl.control import gas
-from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
@@ -60,8 +60,8 @@ def map_pump(
     and gains are then in force.
     """
     before = rig.pump
-    rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
     try:
+        _calmed(rig, limit_um)
         found = _surveyed(rig, limit_um)
         watched = before.model_dump(include={"probe_um", "change_max"})
         found = replace(found, pump=found.pump.model_copy(update=watched))
@@ -77,6 +77,18 @@ def map_pump(
     done = MappedPump(found, before, gain, sigma)
     folder.write(session.file("pump_map.json"), done)
     return done, session
+
+
+def _calmed(rig: HoldRig, limit_um: float) -> None:
+    """Cautious gains from the mean flow, with which an experiment gives the mirror back.
+
+    Without a bump they would begin at the flow of a moment: of a loop that swings on an actuator that takes seconds,
+    up to twice the leak, and they are too slow to take that back before the mirror is 20 um high.
+    """
+    around = rig.around(rig.hold(_BEFORE_S), limit_um)
+    rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
+    mean = trial.PumpStep(fraction=gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1)
+    rig.performed(characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": (mean,)}))
 
 
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:

@@ -123,7 +123,7 @@ def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> No
     """With the line of the defaults the hold of a pump 15 times its leak swings by 20 um, and was not surveyed."""
     pump = ForeignPump("root", 29.4, 0.25, 0.45)
     link, rig, _ = started(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
-    rig.set_gains(rig.loop.model_copy(update=pump_trial._CAUTIOUS), "pump map", 3600.0)
+    pump_trial._calmed(rig, 10.0)
     assert worst_share(pump_trial._surveyed(rig, 10.0), pump) < 0.03
     late = [row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)]
     assert max(abs(row.truth_displacement_um) for row in late) < 12.0
