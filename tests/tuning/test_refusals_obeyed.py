@@ -71,8 +71,8 @@ REFUSALS = {
     "survey stopped by weather": Refusal(
         ("pump", "--limit-um", "30"),
         "in steadier weather",
-        plant=straight(seed=3, weather=8.0, gusts=True, laser_um=3.0),
-        then=straight(seed=3),
+        plant=lambda: ForeignPlant(ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 1.72, 1.25, True, 2.3),
+        then=lambda: ForeignPlant(ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 0.3, 1.25, False, 0.5),
     ),
 }
 

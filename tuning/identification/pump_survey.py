@@ -28,7 +28,7 @@ from tuning.identification.pump_map import (
 )
 
 _KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
-_BENT_SHARE = 0.025  # of the full flow, by which a kink between two levels may be hidden
+_BENT_SHARE = 0.02  # of the full flow, by which a kink between two levels may be hidden
 # Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the curve
 _BENT_LEAKS, _ABOUT_LEAKS, _SURE = 0.15, 2.0, 3.0
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
