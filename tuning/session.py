@@ -236,15 +236,15 @@ def choose(session: folder.SessionFolder, name: str) -> None:
     """Put a candidate into `gains.toml`. Raises InputError if it is unknown or must not be applied."""
     rows, now = offered(session)
     known = {row.name: row for row in rows if row.name != design.PRESENT}
-    known.setdefault(design.SAME_LOAD, next(iter(known.values())))  # the proposal answers a load no worse
+    if name == design.SAME_LOAD and name not in known:
+        name = design.NAMES[0]  # answers a step of the leak no worse
     if name not in known:
         raise errors.InputError(f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}")
-    row = known[name]
-    if why := design.refusal(row):
+    if why := design.refusal(row := known[name]):
         raise errors.InputError(f"{name}: is not applied: {why}")
     assert row.predicted is not None  # else refused
     gains = load_gains(path := session.file("gains.toml"))
-    chosen = {"candidate": row.name, "predicted_std_um": row.predicted.std_um}
+    chosen = {"candidate": name, "predicted_std_um": row.predicted.std_um}
     save_gains(path, gains.model_copy(update={**chosen, "loop": row.gains.applied_to(gains.loop)}))
     if row is not now and session.done("preview"):
         preview_step(session)

@@ -14,7 +14,7 @@ from benchmarks.pumps import worst_share
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
-from membrane_ctrl.control.experiments.trial import PumpStep
+from membrane_ctrl.control.experiments.trial import ExperimentSpec, PumpStep
 from membrane_ctrl.control.gas import PumpCurve
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
@@ -25,7 +25,7 @@ from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
 from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
-from tuning.identification.pump_map import Branch, PumpMap, smoothed
+from tuning.identification.pump_map import Branch, PumpMap, first_jump, smoothed
 from tuning.identification.pump_survey import PumpSurvey
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig
@@ -315,6 +315,50 @@ def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None
     survey = survey_of([0.242, 0.322, 0.422, 0.567, 1.0], [0.0, 0.226, 2.106, 4.83, 13.0], leak)
     survey._branches[True].sigmas[1:] = 0.02
     assert (0.282 in survey._finer(True)) == finer
+
+
+@pytest.mark.parametrize(
+    ("before", "high", "jump"),
+    [(0.0, 0.088, True), (0.142, 0.088, True), (0.6, 0.088, False), (0.0, 0.13, True), (0.142, 0.13, False)],
+)
+def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(before: float, high: float, jump: bool) -> None:
+    """A level below the start read 2.4 % of the full flow in gusts, and the start was taken for a steep rise."""
+    branch = Branch(np.array([0.0, 0.087, high]), np.array([0.0, before, 1.4]), np.array([0.001, 0.25, 0.03]))
+    assert first_jump(branch, 6.0) == ((0.087, high) if jump else None)
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.9])
+def test_the_guard_of_a_round_knows_how_late_the_pump_is(monkeypatch: pytest.MonkeyPatch, late_s: float) -> None:
+    """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 um."""
+    survey = survey_of([0.2, 0.4], [0.5, 3.5], 1.2, delay_s=late_s)
+    monkeypatch.setattr(pump_trial.pump_survey, "PumpSurvey", lambda *given: survey)
+    monkeypatch.setattr(pump_trial, "_brought_back", lambda rig: True)
+    given: list[ExperimentSpec] = []
+
+    def performed(spec: ExperimentSpec) -> None:
+        given.append(spec)
+        raise ValueError("enough")
+
+    rig = SimpleNamespace(
+        hold=lambda seconds: None, around=lambda held, limit_um: pump_trial.machine.Around(1.2, 0.3, 5.0, 0.5),
+        pump=PumpConfig(), performed=performed,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="enough"):
+        pump_trial._surveyed(rig, 10.0)  # type: ignore[arg-type]
+    assert given[0].late_s == pytest.approx(max(0.4, late_s + 0.1))
+
+
+def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path) -> None:
+    """From the flow of a moment they carried the mirror 13 um away."""
+    pump = ForeignPump("dead zone", 13.1, 1.0, 0.1)
+    _, rig, _ = started(tmp_path, ForeignPlant(pump, 3161, 1.0, 2.7, laser_um=0.3))
+    for _ in range(3):  # at any moment of the swing
+        rig.hold(11.3)
+        pump_trial._calmed(rig, 10.0)
+        rows = rig.ticks(20.0)
+        assert rig.loop.kp_per_s == pump_trial._CAUTIOUS["kp_per_s"]
+        assert max(abs(row.truth_displacement_um) for row in rows) < 10.0
+        rig.go_back()
 
 
 @pytest.mark.parametrize(("last", "up"), [(1.0, 0.55), (3.5, 0.4)])

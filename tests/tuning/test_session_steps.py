@@ -22,9 +22,9 @@ from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain, observe
 from tuning.identification.loop_model import Gains, PlantModel, Record, load_record, save_record
 from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
-from tuning.opening import TwinHold
+from tuning.opening import TuneOptions, TwinHold
 from tuning.proposal.prediction import ModelBench, predict
-from tuning.proposal.verify import SETTLE_LEAST_S, VerificationTrial, centre_std_um, health, look, settle_s
+from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, VerificationTrial, centre_std_um, health, look, settle_s
 from tuning.rig import HoldRig, Rig
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
@@ -116,6 +116,17 @@ def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> No
     assert stage.std_um == pytest.approx(after_um, rel=0.05)
     assert stage.before_um == pytest.approx(before_um, rel=0.05)
     assert predict(Gains.of(before), STORM_MODEL, weather, before).std_um < 0.5 * before_um
+
+
+@pytest.mark.parametrize(
+    ("verify_s", "until_s"), [(600.0, [60.0, 180.0, 300.0, 600.0]), (300.0, [60.0, 180.0, 300.0]), (30.0, [30.0])]
+)
+def test_a_short_verification_has_no_shorter_stages(verify_s: float, until_s: list[float]) -> None:
+    """A gust of five seconds is half of what 30 s see, and took good gains back."""
+    assert TuneOptions.stages.fget is not None
+    stages = TuneOptions.stages.fget(SimpleNamespace(verify_s=verify_s))
+    assert [until for until, _ in stages] == until_s
+    assert stages[-1][1] == STAGES[-1][1]
 
 
 def test_a_setpoint_that_moved_is_no_deviation() -> None:

@@ -18,7 +18,7 @@ _REACHES_LEAKS = 1.2
 _FEW_S = 300.0  # of experiments: fewer say nothing of the noise
 _STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
 _NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
-_EDGE_MOST = 0.1  # between the commands of a jump
+_EDGE_MOST, _EDGE_NOISY = 0.1, 0.005  # between the commands of a jump, and of one that begins in noise
 _ASTRAY = (
     "the mirror did not come back to its setpoint within three minutes, with slow gains: the weather is too strong, "
     "or the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
@@ -200,8 +200,9 @@ def first_jump(branch: Branch, full: float) -> tuple[float, float] | None:
         return None
     low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
     before, after = flows[clear[0] - 1 : clear[0] + 1] / full
-    # what comes before is not clear: noise may be more than none
-    return (low, high) if before < JUMP_SHARE < after - before and high - low <= _EDGE_MOST else None
+    # noise may be more than none, but a slope of that height takes more of the command
+    widest = _EDGE_MOST if before < _NONE_SHARE else _EDGE_NOISY
+    return (low, high) if before < JUMP_SHARE < after and high - low <= widest else None
 
 
 def _tuple(values: FloatArray) -> tuple[float, ...]:

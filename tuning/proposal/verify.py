@@ -45,7 +45,7 @@ class Stage:
 
     time_s: float
     std_um: float  # of the centre, from the record
-    before_um: float  # of the old gains: as predicted, after five minutes in this very weather
+    before_um: float  # of the old gains: predicted, or after three minutes replayed in this very weather
     growth: float  # ratio of the two
     growth_max: float  # the limit
     ms: float  # sensitivity seen; NaN while the record is too short

@@ -162,9 +162,9 @@ class FrameFitter:
         self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)  # may trace anew
+        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)  # first: it may trace anew
         fixed = (self._base, turn, shifts, self._maps, self.scene.response, self.scene.edge)
-        # not split: half a millisecond on one core, and a thread that is woken waits for another
+        # On one thread: the model takes half a millisecond, and waking a second thread takes as long
         _model(*fixed, seen_adu, reach, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
