@@ -14,7 +14,16 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import diagnose, drift, parameters, propagate, residuals, solve, verdict
+from membrane_ctrl.metrology.calibrate import (
+    advice,
+    diagnose,
+    drift,
+    parameters,
+    propagate,
+    residuals,
+    solve,
+    verdict,
+)
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
@@ -35,8 +44,8 @@ def report_of(
         return table
     middle = solution.problem.middle
     claim = propagate.propagate(solution, middle, analysis_radius_mm)
-    scale, advice = diagnose.laser_scale(solution), propagate.advice(solution, middle)
-    artefact = propagate.artefact_advice(solution, middle)
+    scale, number = diagnose.laser_scale(solution), advice.number_advice(solution, middle)
+    artefact = advice.artefact_advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
         "condition": propagate.condition_number(solution),
@@ -51,8 +60,9 @@ def report_of(
             "sag_um": claim.sag_um,
             "zernike_um": claim.zernike_um.tolist(),
         },
-        "advice": None if advice is None else asdict(advice),
+        "advice": None if number is None else asdict(number),
         "artefact_advice": None if artefact is None else asdict(artefact),
+        "screen_advice": [asdict(each) for each in advice.screen_advice(solution, middle)],
         "film": solution.problem.references.film,
         "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},
@@ -89,6 +99,12 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
     ]
 
 
+_SCREENS = {
+    "screen": "stand the screen itself about {:.0f} mm before the camera, tilted by 25 degrees to two sides",
+    "screen_moved": "see one film again with the screen {:.0f} mm further from the mirror, known to 0.05 mm",
+}
+
+
 def lines_of(report: dict[str, Any]) -> list[str]:
     """Format the report for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
@@ -114,10 +130,10 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         f"figure with this geometry: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} um RMS"
     )
-    if (advice := report["advice"]) is not None:
-        unit = parameters.ALL[parameters.NAMES.index(advice["name"])].unit
-        known = f"{advice['sigma']:.2g} {unit}".strip()
-        lines.append(f"best next: {advice['name']} known to {known} would give sag +- {advice['sag_um']:.2g} um")
+    if (number := report["advice"]) is not None:
+        unit = parameters.ALL[parameters.NAMES.index(number["name"])].unit
+        known = f"{number['sigma']:.2g} {unit}".strip()
+        lines.append(f"best next: {number['name']} known to {known} would give sag +- {number['sag_um']:.2g} um")
     if (sphere := report["artefact_advice"]) is not None:
         together = " and ".join(sphere["together"][:2])
         lines.append(
@@ -125,6 +141,10 @@ def lines_of(report: dict[str, Any]) -> list[str]:
             + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
             f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} um"
+        )
+    for also, each in zip(("", "also "), report["screen_advice"], strict=False):
+        lines.append(
+            f"better: {also}{_SCREENS[each['sets']].format(abs(each['distance_mm']))}: sag +- {each['sag_um']:.2g} um"
         )
     if report["laser"]["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")

@@ -10,6 +10,7 @@ import pytest
 from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
+from membrane_ctrl.metrology.calibrate.advice import screen_advice
 from membrane_ctrl.metrology.calibrate.lens import screen_seen
 from membrane_ctrl.metrology.calibrate.parameters import (
     NAMES,
@@ -154,6 +155,25 @@ def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> 
     solution = solve(replace(problem, sets=(*direct, *problem.sets)))
     assert_true(solution, values, truth, 3)
     assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx([glass_mm] * 2, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", [9, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(10, 16))])
+def test_advised_screens_keep_their_promise(seed: int) -> None:
+    values, truth, problem = bench_of(seed)
+    alone = solve(problem)
+    first, second = screen_advice(alone, 1)
+    assert (first.sets, second.sets) == ("screen", "screen_moved")
+    assert second.sag_um < first.sag_um < 0.6 * propagate(alone, 1, 475.0).sag_um
+    direct = seen_directly(values, (0.0, 25.0), seed), seen_directly(values, (25.0, 0.0), seed + 50)
+    obeyed = solve(replace(problem, sets=(*direct, *problem.sets)))
+    assert propagate(obeyed, 3, 475.0).sag_um == pytest.approx(first.sag_um, rel=0.2)
+    (left,) = screen_advice(obeyed, 3)
+    assert left.sag_um == pytest.approx(second.sag_um, rel=0.2)
+    far = with_moved_screen(values, truth, problem.sets[1], seed)
+    both = solve(replace(problem, sets=(*direct, problem.sets[0], far)))
+    assert_true(both, values, truth, 3)
+    assert propagate(both, 3, 475.0).sag_um == pytest.approx(second.sag_um, rel=0.2)
+    assert screen_advice(both, 3) == ()
 
 
 def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:

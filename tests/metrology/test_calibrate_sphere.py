@@ -9,8 +9,9 @@ import pytest
 from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
+from membrane_ctrl.metrology.calibrate.advice import artefact_advice
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas, usual_sigma
-from membrane_ctrl.metrology.calibrate.propagate import artefact_advice, propagate
+from membrane_ctrl.metrology.calibrate.propagate import propagate
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve

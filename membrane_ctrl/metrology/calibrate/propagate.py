@@ -12,11 +12,10 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve, step
+from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import (
     PARAMETERS,
-    Artefact,
     Surface,
     parameter_to_coeffs,
     sag_gradient,
@@ -58,97 +57,13 @@ def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Prop
     return Propagated(
         height_rms_um=_rms_um(heights, covariance),
         figure_rms_um=_rms_um(flat, covariance),
-        sag_um=_sag_um(covariance),
+        sag_um=sag_um(covariance),
         zernike_um=1e3 * np.sqrt(np.diag(to_coeffs @ covariance @ to_coeffs.T)),
     )
 
 
-_BETTER = 5.0  # times: what another instrument may give
-_WORTH = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
-
-
-@dataclass(frozen=True)
-class Advice:
-    """The one hand measurement that would lower the sag's sigma most."""
-
-    name: str
-    sigma: float  # to which it should be known
-    sag_um: float  # 1 sigma then
-
-
-def advice(solution: Solution, index: int) -> Advice | None:
-    """What to measure better, from the equations alone; None if no single number is worth it."""
-    sums, own = np.sum([each.reduced() for each in solution.equations], axis=0), solution.problem.sigmas
-    found = []
-    for k in np.flatnonzero(own > 0):
-        better = own.copy()
-        better[k] /= _BETTER
-        moved = replace(solution, covariance=step(sums + solution.known(better), better).covariance)
-        sag_um = _sag_um(surface_covariance(moved, index))
-        found.append(Advice(parameters.NAMES[k], float(better[k]), sag_um))
-    best = min(found, key=lambda each: each.sag_um, default=None)
-    return best if best is not None and best.sag_um < _WORTH * _sag_um(surface_covariance(solution, index)) else None
-
-
-# A sphere that a telescope maker can deliver: radius of curvature by interferometer and scale, place by a dial gauge
-_SPHERE_MM, _SPHERE_USED = 200.0, 0.95
-_SPHERE_KNOWN, _FORM_MM, _VERTEX_MM = 1e-4, 5e-5, 0.05
-
-
-@dataclass(frozen=True)
-class ArtefactAdvice:
-    """A sphere in the mirror's place, where lengths of the bench cannot be told apart."""
-
-    together: tuple[str, ...]  # parameters that move together
-    curvature_radius_mm: float
-    curvature_radius_sigma_mm: float
-    vertex_sigma_mm: float
-    radius_mm: float  # of the sphere's edge
-    sag_um: float  # 1 sigma then
-
-
-def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
-    """What a sphere in the mirror's place would give; None if it is not worth it, or if an artefact stood there.
-
-    Its set is foreseen from the bench found: rays of the film's set that meet the sphere, with their noise.
-    """
-    if solution.problem.with_artefact:
-        return None
-    now = surface_covariance(solution, index)
-    phases, surface = solution.problem.sets[index], solution.states[index].surface
-    phases = replace(phases.subset(phases.seen_with(0)), elsewhere=())
-    # as deep as the film, so that the fringes fall on the same places of the screen
-    curvature_mm = (surface.radius_mm**2 + surface.sag_mm**2) / (2 * surface.sag_mm)
-    spread = _SPHERE_KNOWN / curvature_mm
-    sphere = Artefact(1 / curvature_mm, spread, _FORM_MM, 0.0, _VERTEX_MM, min(_SPHERE_MM, surface.radius_mm))
-    terms = sphere.terms_mm()
-    shape = replace(
-        Surface.from_parameters(terms[:PARAMETERS], sphere.radius_mm), beyond_mm=tuple(terms[PARAMETERS:].tolist())
-    )
-    bench, turns = solution.bench, parameters.pose_derivatives(solution.problem.stated, solution.values)
-    points = residuals.place_rays(bench, phases, shape, 0.0)
-    x_mm, y_mm, _z = bench.geometry.pinhole_mm[:, None] + points.t_mm * points.rays
-    seen = replace(phases, displacement_um=np.nan, artefact=sphere).subset(
-        np.hypot(x_mm, y_mm) < _SPHERE_USED * sphere.radius_mm
-    )
-    if seen.sigma_mm.size < 2 * residuals.LOCAL:
-        return None
-    seen = replace(seen, screen_mm=seen.screen_mm - residuals.residual_mm(bench, seen, shape, 0.0))
-    state = separable.SetState(shape, 0.0)
-    trust, known = separable.Trust.full(seen), solution.problem.references
-    more = separable.equations(bench, turns, seen, state, solution.common, known, trust).reduced()
-    sums = np.sum([each.reduced() for each in solution.equations], axis=0)
-    sigmas = solution.problem.sigmas
-    then = replace(solution, covariance=step(sums + more + solution.known(sigmas), sigmas).covariance)
-    sag_um, now_um = (_sag_um(covariance) for covariance in (surface_covariance(then, index), now))
-    if not sag_um < _WORTH * now_um:
-        return None
-    worst = max(weak_combinations(solution, index, surface.radius_mm), key=lambda each: each.figure_um, default=None)
-    together = () if worst is None else tuple(name for name, _ in worst.parts)
-    return ArtefactAdvice(together, curvature_mm, _SPHERE_KNOWN * curvature_mm, _VERTEX_MM, sphere.radius_mm, sag_um)
-
-
-def _sag_um(covariance: FloatArray) -> float:
+def sag_um(covariance: FloatArray) -> float:
+    """Standard deviation of the sag from a covariance (36, 36) in mm^2 of a surface's parameters."""
     return 1e3 * float(np.sqrt(sag_gradient() @ covariance @ sag_gradient()))
 
 

@@ -148,6 +148,8 @@ def residual_mm(
     """Seen minus predicted screen points (2, n); `elsewhere` are the moves (MOVED,) of the screen."""
     out = np.empty_like(phases.screen_mm)
     for _, there, _, some in views(bench, [], phases, elsewhere):
+        if not some.any():  # a set that is foreseen for one place of the screen
+            continue
         part = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
         points = place_rays(there, part, surface, vertex_z_mm)
