@@ -18,7 +18,7 @@ from firmware_iface.roles import Camera, Pattern, Pixels, Screen
 from membrane_ctrl.acquisition import exposures, process
 from membrane_ctrl.geometry.file import InForce
 from membrane_ctrl.metrology import bins, phase
-from membrane_ctrl.metrology.calibrate.drift import DriftMonitor, RingMonitor, noise_urad
+from membrane_ctrl.metrology.calibrate.verdict import DriftMonitor, RingMonitor, noise_urad
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model import events, run_events, shape_estimate

@@ -17,7 +17,6 @@ from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.metrology.calibrate import (
     advice,
     diagnose,
-    drift,
     parameters,
     propagate,
     residuals,
@@ -218,7 +217,7 @@ def write_geometry(
     films = [(solution.states[k], problem.sets[k]) for k in problem.films]
     slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
     noises = [
-        drift.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
+        verdict.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
         for state, phases in films
     ]
     origin = solve.Origin(

@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl.acquisition.cycle import LiveDrift, geometry_event
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
-from membrane_ctrl.metrology.calibrate.drift import CYCLES, ring_um
+from membrane_ctrl.metrology.calibrate.verdict import CYCLES, ring_um
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

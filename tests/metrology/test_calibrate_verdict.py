@@ -11,11 +11,10 @@ import pytest
 from calibration_truth import SAGS_MM, Truth, make
 
 from membrane_ctrl.metrology.calibrate.diagnose import bumps, left_out, suspects
-from membrane_ctrl.metrology.calibrate.drift import CYCLES, DriftMonitor
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.solve import solve
-from membrane_ctrl.metrology.calibrate.verdict import CalibrationFinding, after, before
+from membrane_ctrl.metrology.calibrate.verdict import CYCLES, CalibrationFinding, DriftMonitor, after, before
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.propagate import sag_um, surface_covariance, weak_combinations
 from membrane_ctrl.metrology.calibrate.solve import Solution, step
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 _BETTER = 5.0  # times: what another instrument may give
 _WORTH = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
@@ -177,7 +177,7 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> Solution:
     again = replace(again, elsewhere=(known,), screen=np.ones(again.sigma_mm.size, int))
     state = replace(state, elsewhere=(move,))
     at_mm = -residuals.residual_mm(solution.bench, _dark(again), state.surface, state.vertex_z_mm, state.elsewhere)
-    seen = (np.abs(at_mm) < half_mm[:, None]).all(axis=0)
+    seen = _on_fringes(at_mm, half_mm)
     again = replace(again, screen_mm=at_mm).subset(seen)
     both = replace(
         film,
@@ -194,6 +194,10 @@ def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> Solution:
     return _with_equations(solution, tuple(linear))
 
 
+def _on_fringes(at_mm: FloatArray, half_mm: FloatArray) -> BoolArray:
+    return np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0))
+
+
 def _dark(phases: residuals.SetPhases) -> residuals.SetPhases:
     return replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
 
@@ -203,7 +207,7 @@ def _foreseen(
 ) -> separable.Equations:
     """Equations of a set whose rays end where the bench found sends them, on the fringes."""
     at_mm = -residuals.residual_mm(solution.bench, _dark(phases), state.surface, state.vertex_z_mm, state.elsewhere)
-    seen = replace(phases, screen_mm=at_mm).subset((np.abs(at_mm) < half_mm[:, None]).all(axis=0))
+    seen = replace(phases, screen_mm=at_mm).subset(_on_fringes(at_mm, half_mm))
     return _equations(solution, seen, state, separable.Trust.full(seen))
 
 
