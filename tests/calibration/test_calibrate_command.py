@@ -192,6 +192,25 @@ def test_wrong_options_are_said(
     assert says in capsys.readouterr().err
 
 
+def test_sets_that_name_different_readings_as_the_origin_are_told_so(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Simulated sets without a common reference are of different benches, and were refused with a creeping camera."""
+    other = tmp_path / "other"
+    shutil.copytree(folders[0], other)
+    text = (other / "capture.toml").read_text()
+    assert "reference_displacement_um = 0.0" in text
+    (other / "capture.toml").write_text(
+        text.replace("reference_displacement_um = 0.0", "reference_displacement_um = -4000.0")
+    )
+    run(["calibrate", str(folders[2]), str(other), "--out", str(tmp_path / "geometry.toml")])
+    said = capsys.readouterr()
+    assert "the sets name readings from -4000 to 0 um as reference_displacement_um" in said.out + said.err
+    run(["calibrate", str(folders[2]), str(folders[0]), "--out", str(tmp_path / "geometry.toml")])
+    said = capsys.readouterr()
+    assert "the sets name readings" not in said.out + said.err
+
+
 def test_a_set_given_twice_is_refused(folders: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", str(folders[0]), str(folders[0])]) == 2
     assert "given twice" in capsys.readouterr().err
