@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,26 +129,30 @@ def true_bench(stated: OpticsConfig, rng: np.random.Generator) -> tuple[OpticsCo
     """The bench as it really is, grown since it was measured; and by how much each input was stated wrong."""
     spread, _ = spread_of(stated, None)
     off = dict(zip(spread.names, spread.draw(rng), strict=True))
+    grown = 1 + STEEL_PER_K * stated_sigmas(stated).temperature_k * rng.standard_normal()
+    return bench_off_by(stated, off, grown), off
+
+
+def bench_off_by(stated: OpticsConfig, off: Mapping[str, float], grown: float = 1.0) -> OpticsConfig:
+    """The bench that is stated wrong by these amounts, and has grown by this factor since."""
     there = bench_at(Geometry.from_config(stated), np.array([off.get(name, 0.0) for name in NAMES]))
     geometry = there.geometry
-    grown = 1 + STEEL_PER_K * stated_sigmas(stated).temperature_k * rng.standard_normal()
     rows = [tuple(row) for row in geometry.rotation]
     camera = CameraPoseConfig(position_mm=tuple(grown * geometry.pinhole_mm), rotation=(rows[0], rows[1], rows[2]))
     screen = ScreenPoseConfig(
         origin_mm=tuple(grown * geometry.screen_origin_mm),
         s_x=tuple(geometry.screen_s_x),
         s_y=tuple(geometry.screen_s_y),
-        bow_mm=off["bow_mm"],
+        bow_mm=off.get("bow_mm", 0.0),
     )
     lens = {"focal_mm": geometry.focal_px * stated.camera.pixel_um * 1e-3, "principal_px": geometry.principal_px}
-    optics = OpticsConfig(
+    return OpticsConfig(
         geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
         camera=stated.camera.model_copy(
             update={**lens, "distortion": geometry.distortion, "bits": 16, "noise_adu": 0.0}  # see `Room.stack`
         ),
         pattern=stated.pattern.model_copy(update={"period_mm": stated.pattern.period_mm * there.pitch}),
     )
-    return optics, off
 
 
 @dataclass

@@ -204,8 +204,8 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     named = sorted({benches[k].geometry.reference_displacement_um or 0.0 for k in films})
     if reference_um is None and len(named) > 1:
         notes.append(
-            f"the sets name readings from {named[0]:.0f} to {named[-1]:.0f} um as reference_displacement_um; the first "
-            "set's is used: if the geometry was stated anew for each set, they are not of one bench"
+            f"the sets name readings from {named[0]:.0f} to {named[-1]:.0f} um as reference_displacement_um; "
+            "the first set's is used: if the geometry was stated anew for each set, they are not of one bench"
         )
     reference_um = _reference_um([sets[k] for k in films], [benches[k] for k in films], reference_um)
     if not any(math.isfinite(sets[k].displacement_um) for k in films):
