@@ -218,7 +218,7 @@ def examine(
         *budget.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *budget.bench_sources(bench, sigmas),
         *film,
-        _vertex(bench, sigmas, checked),
+        _vertex(bench, sigmas, checked, film[0].sigma),
         _law(full, slope_variance),
         blur,
         *budget.frame_sources(bench, optics, shifts, _film_um(moved), math.hypot(budget.LIGHT, checked.light_left)),
@@ -239,12 +239,12 @@ def vertex_um(readings_um: FloatArray, laser_noise_um: float) -> float:
     return laser_noise_um / math.sqrt(readings_um.size) if known else _UNKNOWN_UM
 
 
-def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked) -> budget.Source:
-    """Where the vertex is: by the laser, or nobody knows."""
+def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked, moved_um: float) -> budget.Source:
+    """Where the vertex is: by the laser, or nobody knows; half a motion from x to y is in the frames' mean."""
     readings = checked.stack.readings_um
     noise_um = vertex_um(readings, LASER_NOISE_UM)
     if not np.isfinite(readings).all():
-        return budget.vertex_source(bench, noise_um, "place of the vertex, without a laser")
+        return budget.vertex_source(bench, math.hypot(noise_um, moved_um / 2), "place of the vertex, without a laser")
     scale_um = 1e3 * sigmas.laser_relative * abs(bench.vertex_z_mm)
     says = "place of the vertex, by the laser's noise and scale"
     return budget.vertex_source(bench, math.hypot(noise_um, scale_um), says)
