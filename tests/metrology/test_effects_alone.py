@@ -1,0 +1,34 @@
+"""One effect at a time that `measure` is not told of, rendered by a ray tracer that shares no code with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.effects import EFFECTS, Effect, answer
+
+BY_NAME = {effect.says: effect for effect in EFFECTS}
+
+
+def assert_held(effect: Effect, doubt: str) -> None:
+    """The errors are as large as their bars at most, and the verdict says why they are wide."""
+    found = answer(effect, seed=3)
+    assert not isinstance(found, str)
+    errors_um, sigmas_um, verdict, doubts = found
+    assert np.all(np.abs(errors_um) < 3 * sigmas_um)
+    assert verdict == ("degraded" if doubt else "ok")
+    assert doubt in " ".join(doubts)
+
+
+@pytest.mark.parametrize("moved_um", [100, 500])
+def test_a_film_that_moved_without_a_laser_is_in_the_bar_of_its_sag(moved_um: int) -> None:
+    """The mean of the frames is half the motion away from the first: the sag was 6 sigma off."""
+    assert_held(BY_NAME[f"film {moved_um} um deeper in y, no laser"], "from the x to the y frames")
+
+
+@pytest.mark.parametrize(
+    ("name", "doubt"),
+    [("nothing", ""), ("camera turned by 0.1 degrees", "the rim is"), ("blur of 8 px", "focus the camera")],
+)
+def test_what_a_set_says_of_itself_is_in_its_verdict(name: str, doubt: str) -> None:
+    assert_held(BY_NAME[name], doubt)
