@@ -28,6 +28,7 @@ NAMES = (
     "measure_full",
     "monte_carlo",
     "acquisition",
+    "tracking_live",
     "virtual_time",
     "held",
     "centre",
