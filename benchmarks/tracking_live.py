@@ -138,8 +138,3 @@ def _measured(screen: Panel) -> list[Figure]:
         Figure("figures within 15 ms", 100 * float(np.mean(np.array(late_ms) < 15.0)), "%"),
         at_most("frames lost and retaken", lost, "of all", None),
     ]
-
-
-if __name__ == "__main__":
-    for figure in run():
-        print(f"{figure.name}: {figure.value:.2f} {figure.unit}")

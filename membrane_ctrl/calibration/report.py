@@ -99,9 +99,10 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
 
 
 _SCREENS = {
-    "screen": "stand the screen itself about {:.0f} mm before the camera, tilted by 25 degrees to two sides",
-    "screen_moved": "see one film again with the screen {:.0f} mm further from the mirror, known to 0.05 mm",
+    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two sides",
+    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",
 }
+_SCREEN_KNOWN = {"screen": advice.TILT_DEG, "screen_moved": advice.RAIL_SIGMA_MM}
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:
@@ -141,10 +142,9 @@ def lines_of(report: dict[str, Any]) -> list[str]:
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
             f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} um"
         )
-    for also, each in zip(("", "also "), report["screen_advice"], strict=False):
-        lines.append(
-            f"better: {also}{_SCREENS[each['sets']].format(abs(each['distance_mm']))}: sag +- {each['sag_um']:.2g} um"
-        )
+    for where, each in zip(("with the screen alone", "and then"), report["screen_advice"], strict=False):
+        do = _SCREENS[each["sets"]].format(abs(each["distance_mm"]), _SCREEN_KNOWN[each["sets"]])
+        lines.append(f"{where}: {do}: sag +- {each['sag_um']:.2g} um")
     if report["laser"]["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")

@@ -204,8 +204,8 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     named = sorted({benches[k].geometry.reference_displacement_um or 0.0 for k in films})
     if reference_um is None and len(named) > 1:
         notes.append(
-            f"the sets name readings from {named[0]:.0f} to {named[-1]:.0f} um as reference_displacement_um; "
-            "the first set's is used: if the geometry was stated anew for each set, they are not of one bench"
+            f"the sets state reference_displacement_um from {named[0]:.0f} to {named[-1]:.0f} um; the first set's is "
+            "used: if the geometry was measured anew for each set, they are not of one bench"
         )
     reference_um = _reference_um([sets[k] for k in films], [benches[k] for k in films], reference_um)
     if not any(math.isfinite(sets[k].displacement_um) for k in films):
@@ -259,16 +259,7 @@ def _join(
         phases.motion_um,
         phases.motion_sigma_um,
     )
-    before = np.zeros(base.sigma_mm.size, int) if base.screen is None else base.screen
-    sets[k] = replace(
-        base,
-        column_px=np.append(base.column_px, phases.column_px),
-        row_px=np.append(base.row_px, phases.row_px),
-        screen_mm=np.hstack([base.screen_mm, phases.screen_mm]),
-        sigma_mm=np.append(base.sigma_mm, phases.sigma_mm),
-        elsewhere=(*base.elsewhere, known),
-        screen=np.append(before, np.full(phases.sigma_mm.size, len(base.elsewhere) + 1)),
-    )
+    sets[k] = base.beside(phases, known)
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:

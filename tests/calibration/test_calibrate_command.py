@@ -192,10 +192,10 @@ def test_wrong_options_are_said(
     assert says in capsys.readouterr().err
 
 
-def test_sets_that_name_different_readings_as_the_origin_are_told_so(
+def test_the_report_notes_sets_that_state_different_references(
     folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Simulated sets without a common reference are of different benches, and were refused with a creeping camera."""
+    """Simulated sets without a common reference are of different benches, and the refusal named a creeping camera."""
     other = tmp_path / "other"
     shutil.copytree(folders[0], other)
     text = (other / "capture.toml").read_text()
@@ -205,10 +205,10 @@ def test_sets_that_name_different_readings_as_the_origin_are_told_so(
     )
     run(["calibrate", str(folders[2]), str(other), "--out", str(tmp_path / "geometry.toml")])
     said = capsys.readouterr()
-    assert "the sets name readings from -4000 to 0 um as reference_displacement_um" in said.out + said.err
+    assert "the sets state reference_displacement_um from -4000 to 0 um" in said.out + said.err
     run(["calibrate", str(folders[2]), str(folders[0]), "--out", str(tmp_path / "geometry.toml")])
     said = capsys.readouterr()
-    assert "the sets name readings" not in said.out + said.err
+    assert "the sets state" not in said.out + said.err
 
 
 def test_a_set_given_twice_is_refused(folders: list[Path], capsys: pytest.CaptureFixture[str]) -> None:

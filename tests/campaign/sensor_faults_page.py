@@ -50,7 +50,7 @@ NOTES: tuple[tuple[str, str, str], ...] = (
         "laser",
         "drifts by 2 um/min",
         "The run ends after an hour, with the mirror 120 um astray. So slow a mount is what the camera is "
-        "for; the gauge resolves it at about 125 um, see the next drifts.",
+        "for; the gauge notices the next slowest drift here at 125 um.",
     ),
     (
         "laser",

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.propagate import sag_um, surface_covariance, weak_combinations
 from membrane_ctrl.metrology.calibrate.solve import Solution, step
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.arrays import FloatArray
 
 _BETTER = 5.0  # times: what another instrument may give
 _WORTH = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
@@ -66,7 +66,6 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     """
     if solution.problem.with_artefact:
         return None
-    now = surface_covariance(solution, index)
     phases, surface = solution.problem.sets[index], solution.states[index].surface
     phases = replace(phases.subset(phases.seen_with(0)), elsewhere=())
     # as deep as the film, so that the fringes fall on the same places of the screen
@@ -77,7 +76,7 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     shape = replace(
         Surface.from_parameters(terms[:PARAMETERS], sphere.radius_mm), beyond_mm=tuple(terms[PARAMETERS:].tolist())
     )
-    bench, turns = solution.bench, parameters.pose_derivatives(solution.problem.stated, solution.values)
+    bench = solution.bench
     points = residuals.place_rays(bench, phases, shape, 0.0)
     x_mm, y_mm, _z = bench.geometry.pinhole_mm[:, None] + points.t_mm * points.rays
     seen = replace(phases, displacement_um=np.nan, artefact=sphere).subset(
@@ -86,13 +85,9 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     if seen.sigma_mm.size < 2 * residuals.LOCAL:
         return None
     seen = replace(seen, screen_mm=seen.screen_mm - residuals.residual_mm(bench, seen, shape, 0.0))
-    state = separable.SetState(shape, 0.0)
-    trust, known = separable.Trust.full(seen), solution.problem.references
-    more = separable.equations(bench, turns, seen, state, solution.common, known, trust).reduced()
-    sums = np.sum([each.reduced() for each in solution.equations], axis=0)
-    sigmas = solution.problem.sigmas
-    then = replace(solution, covariance=step(sums + more + solution.known(sigmas), sigmas).covariance)
-    then_um, now_um = (sag_um(covariance) for covariance in (surface_covariance(then, index), now))
+    more = _equations(solution, seen, separable.SetState(shape, 0.0), separable.Trust.full(seen))
+    then = _with_equations(solution, (*solution.equations, more))
+    then_um, now_um = (sag_um(surface_covariance(each, index)) for each in (then, solution))
     if not then_um < _WORTH * now_um:
         return None
     worst = max(weak_combinations(solution, index, surface.radius_mm), key=lambda each: each.figure_um, default=None)
@@ -100,10 +95,11 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     return ArtefactAdvice(together, curvature_mm, _SPHERE_KNOWN * curvature_mm, _VERTEX_MM, sphere.radius_mm, then_um)
 
 
-# The screen itself before the camera, and the screen on a rail: what a pair of hands and a steel rule can do
-_TILTED_DEG = ((0.0, 25.0), (25.0, 0.0))  # to two sides: one tilt leaves the focal length with the distance
+# The screen itself before the camera, and the screen on a rail: what a pair of hands and a dial gauge can do
+TILT_DEG = 25.0  # of the screen itself, to two sides: one tilt leaves the focal length with the distance
+RAIL_SIGMA_MM = 0.05
+_RAIL_MM, _RAIL_TURN_DEG = -300.0, 0.5  # away from the mirror
 _FILLS = 0.9  # of the picture that the fringes fill
-_RAIL_MM, _RAIL_SIGMA_MM, _RAIL_TURN_DEG = -300.0, 0.05, 0.5  # away from the mirror; a dial gauge's length
 
 
 @dataclass(frozen=True)
@@ -122,93 +118,69 @@ def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
     """
     problem, found = solution.problem, solution
     half_mm = np.max([np.abs(problem.sets[k].screen_mm).max(axis=1) for k in problem.films], axis=0)
-    left: dict[Literal["screen", "screen_moved"], float] = {}
+    left: list[Literal["screen", "screen_moved"]] = []
     if not any(isinstance(phases.artefact, SeenScreen) for phases in problem.sets):
-        left["screen"] = _fills_mm(solution, index, half_mm)
+        left.append("screen")
     if not any(problem.sets[k].elsewhere for k in problem.films):
-        left["screen_moved"] = _RAIL_MM
+        left.append("screen_moved")
     out: list[ScreenAdvice] = []
     while left:
-        tried = {
-            name: _with_screens(found, index, half_mm, mm) if name == "screen" else _with_rail(found, index, half_mm)
-            for name, mm in left.items()
-        }
-        claims = {name: sag_um(surface_covariance(then, index)) for name, then in tried.items()}
+        tried = {name: _FORESEEN[name](found, index, half_mm) for name in left}
+        claims = {name: sag_um(surface_covariance(then, index)) for name, (then, _) in tried.items()}
         name = min(claims, key=lambda each: claims[each])
         if not claims[name] < _WORTH * sag_um(surface_covariance(found, index)):
             break
-        out.append(ScreenAdvice(name, left.pop(name), claims[name]))
-        found = tried[name]
+        found, distance_mm = tried[name]
+        out.append(ScreenAdvice(name, distance_mm, claims[name]))
+        left.remove(name)
     return tuple(out)
 
 
-def _fills_mm(solution: Solution, index: int, half_mm: FloatArray) -> float:
-    """Distance at which the fringes fill the part of the picture that sees the mirror."""
-    rays = solution.bench.geometry.rotation @ residuals.camera_rays(
-        solution.bench.geometry, solution.problem.sets[index]
+def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Solution, float]:
+    """The solution with sets of the screen itself, tilted to two sides, and its distance from the camera."""
+    film, camera = solution.problem.sets[index], solution.bench.geometry
+    film = replace(
+        film.subset(film.seen_with(0)), displacement_um=np.nan, screen=None, elsewhere=(residuals.ANYWHERE,)
     )
-    return float(_FILLS * 2 * np.min(half_mm) / np.ptp(rays[:2] / rays[2], axis=1).max())
-
-
-def _with_screens(solution: Solution, index: int, half_mm: FloatArray, distance_mm: float) -> Solution:
-    """The solution with sets of the screen itself at that distance, tilted to two sides."""
-    film, state = solution.problem.sets[index], solution.states[index]
-    film = replace(film.subset(film.seen_with(0)), displacement_um=np.nan, screen=None)
-    rays = solution.bench.geometry.rotation @ residuals.camera_rays(solution.bench.geometry, film)
-    middle = np.append((rays[:2] / rays[2]).mean(axis=1), 1.0)
-    state = separable.SetState(state.surface, 0.0, elsewhere=(np.zeros(residuals.MOVED),))
+    rays = camera.rotation @ residuals.camera_rays(camera, film)
+    tangents = rays[:2] / rays[2]
+    distance_mm = float(_FILLS * 2 * np.min(half_mm) / np.ptp(tangents, axis=1).max())
+    middle = np.append(tangents.mean(axis=1), 1.0)
+    state = separable.SetState(solution.states[index].surface, 0.0, elsewhere=(np.zeros(residuals.MOVED),))
     more = []
-    for tilt_deg in _TILTED_DEG:
-        # its back to the camera's view: s_y goes up in the picture
-        facing = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
-        screen = SeenScreen(distance_mm * middle, facing.T)
-        more.append(
-            _foreseen(solution, replace(film, artefact=screen, elsewhere=(residuals.ANYWHERE,)), state, half_mm)
-        )
-    return _with_equations(solution, (*solution.equations, *more))
+    for turn in ("x", "y"):
+        # it faces the camera, and s_y goes up in the picture
+        facing = Rotation.from_euler(turn, TILT_DEG, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        phases = replace(film, artefact=SeenScreen(distance_mm * middle, facing.T))
+        seen = _foreseen(solution, phases, state, half_mm)
+        more.append(_equations(solution, seen, state, separable.Trust.full(seen)))
+    return _with_equations(solution, (*solution.equations, *more)), distance_mm
 
 
-def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> Solution:
-    """The solution with the film of one set seen again, the screen moved along a rail."""
-    film, state, now = solution.problem.sets[index], solution.states[index], solution.equations[index]
-    known = residuals.Elsewhere((0.0, 0.0, _RAIL_MM), _RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
+def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Solution, float]:
+    """The solution with the film of one set seen again, the screen moved along a rail, and by how far."""
+    film, now = solution.problem.sets[index], solution.equations[index]
+    known = residuals.Elsewhere((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
     move = known.known(solution.problem.references.laser_sigma_um)[0]
-    again = film.subset(film.seen_with(0))
-    again = replace(again, elsewhere=(known,), screen=np.ones(again.sigma_mm.size, int))
-    state = replace(state, elsewhere=(move,))
-    at_mm = -residuals.residual_mm(solution.bench, _dark(again), state.surface, state.vertex_z_mm, state.elsewhere)
-    seen = _on_fringes(at_mm, half_mm)
-    again = replace(again, screen_mm=at_mm).subset(seen)
-    both = replace(
-        film,
-        column_px=np.append(film.column_px, again.column_px),
-        row_px=np.append(film.row_px, again.row_px),
-        screen_mm=np.hstack([film.screen_mm, again.screen_mm]),
-        sigma_mm=np.append(film.sigma_mm, again.sigma_mm),
-        elsewhere=(known,),
-        screen=np.repeat([0, 1], [film.sigma_mm.size, again.sigma_mm.size]),
-    )
+    state = replace(solution.states[index], elsewhere=(move,))
+    there = _foreseen(solution, film.beside(film, known), state, half_mm)
+    again = there.subset(there.seen_with(1))
     trust = replace(now.trust, weights=np.append(now.trust.weights, np.ones(again.sigma_mm.size)))
     linear = list(solution.equations)
-    linear[index] = _equations(solution, both, state, trust)
-    return _with_equations(solution, tuple(linear))
+    linear[index] = _equations(solution, film.beside(again, known), state, trust)
+    return _with_equations(solution, tuple(linear)), _RAIL_MM
 
 
-def _on_fringes(at_mm: FloatArray, half_mm: FloatArray) -> BoolArray:
-    return np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0))
-
-
-def _dark(phases: residuals.SetPhases) -> residuals.SetPhases:
-    return replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
+_FORESEEN = {"screen": _with_screens, "screen_moved": _with_rail}
 
 
 def _foreseen(
     solution: Solution, phases: residuals.SetPhases, state: separable.SetState, half_mm: FloatArray
-) -> separable.Equations:
-    """Equations of a set whose rays end where the bench found sends them, on the fringes."""
-    at_mm = -residuals.residual_mm(solution.bench, _dark(phases), state.surface, state.vertex_z_mm, state.elsewhere)
-    seen = replace(phases, screen_mm=at_mm).subset(_on_fringes(at_mm, half_mm))
-    return _equations(solution, seen, state, separable.Trust.full(seen))
+) -> residuals.SetPhases:
+    """A set whose rays end where the bench found sends them; those that end on the fringes."""
+    dark = replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
+    at_mm = -residuals.residual_mm(solution.bench, dark, state.surface, state.vertex_z_mm, state.elsewhere)
+    return replace(phases, screen_mm=at_mm).subset(np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0)))
 
 
 def _equations(

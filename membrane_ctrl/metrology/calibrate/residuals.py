@@ -15,6 +15,7 @@ with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y t
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial as series
@@ -74,6 +75,7 @@ class Elsewhere:
 # of the screen seen directly: nothing is known of its place, and its pixels may lie behind some mm of glass
 ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
 _GLASS_INDEX = 1.52
+_PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # the last axis: points
 
 
 @dataclass(frozen=True)
@@ -104,14 +106,15 @@ class SetPhases:
 
     def subset(self, keep: slice | BoolArray) -> "SetPhases":
         """Some of the bins."""
-        return replace(
-            self,
-            column_px=self.column_px[keep],
-            row_px=self.row_px[keep],
-            screen_mm=self.screen_mm[:, keep],
-            sigma_mm=self.sigma_mm[keep],
-            screen=None if self.screen is None else self.screen[keep],
-        )
+        parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
+        return replace(self, **parts, screen=None if self.screen is None else self.screen[keep])
+
+    def beside(self, again: "SetPhases", known: Elsewhere) -> "SetPhases":
+        """The set with the points of the same film, seen again with the screen elsewhere."""
+        before = np.zeros(self.sigma_mm.size, int) if self.screen is None else self.screen
+        screen = np.append(before, np.full(again.sigma_mm.size, len(self.elsewhere) + 1))
+        parts: Any = {name: np.concatenate([getattr(k, name) for k in (self, again)], -1) for name in _PER_POINT}
+        return replace(self, **parts, elsewhere=(*self.elsewhere, known), screen=screen)
 
 
 @dataclass(frozen=True)
@@ -148,8 +151,6 @@ def residual_mm(
     """Seen minus predicted screen points (2, n); `elsewhere` are the moves (MOVED,) of the screen."""
     out = np.empty_like(phases.screen_mm)
     for _, there, _, some in views(bench, [], phases, elsewhere):
-        if not some.any():  # a set that is foreseen for one place of the screen
-            continue
         part = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
         points = place_rays(there, part, surface, vertex_z_mm)
