@@ -9,8 +9,9 @@ import pytest
 from calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
 from metrology_truth import hencky_depth
 
+from membrane_ctrl.metrology.calibrate.advice import number_advice
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.propagate import advice, propagate
+from membrane_ctrl.metrology.calibrate.propagate import propagate
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.ring_pose import Rim
 from membrane_ctrl.metrology.calibrate.separable import FilmModel, Trust, beyond_of, less_trust
@@ -77,7 +78,7 @@ def test_the_rim_knows_the_size_and_better_measurements_are_advised() -> None:
     claims = [propagate(solution, 2, 475.0).sag_um for solution in (with_rim, without)]
     assert claims[0] < 0.95 * claims[1]
     assert abs(calibrated_errors_um(with_rim, truth)[0]) < 3 * claims[0]
-    best = advice(without, 2)
+    best = number_advice(without, 2)
     assert best is not None
     better = SIGMAS.copy()
     better[NAMES.index(best.name)] = best.sigma
