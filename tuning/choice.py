@@ -102,7 +102,7 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
     config = toml_file.load(path, schema.Config)
-    if config.estimator.process_value == "estimate":
+    if config.estimator.process_value != "laser":
         return _save_estimator(path, newest_session(logs) if name is None else open_session(name), config, yes)
     folder, shape_s = _named(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS

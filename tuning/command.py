@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
 
-from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError, writing
 from membrane_ctrl.sessions import folder as plain
@@ -77,7 +77,7 @@ def one_step(step: str, options: TuneOptions) -> int:
 
 def _do_all(todo: list[str], folder: SessionFolder, rig: HoldRig, options: TuneOptions, progress: Progress) -> None:
     for number, step in enumerate(todo):
-        if step in _OF_GAINS and folder.config.estimator.process_value == "estimate":
+        if step in _OF_GAINS and folder.config.estimator.process_value != "laser":
             told = _NO_GAINS.format(folder.path)
             if todo == [step]:
                 raise RejectedError(f"{step}: {told}")
@@ -127,7 +127,8 @@ def outer(options: TuneOptions) -> int:
     from tuning.identification import shape_loop
 
     assumed = zernike_projection()
-    with opening.opened(options, again="run `membrane-ctrl tune outer` again") as (folder, rig, progress):
+    again = "run `membrane-ctrl tune outer` again"
+    with opening.opened(options, again=again, refusal=_without_laser) as (folder, rig, progress):
         before_s = folder.config.shape.time_constant_s
         progress.begin("shape loop", shape_loop.TYPICAL_S + options.observe_s, options.verify_s)
         rig.hold(options.observe_s)
@@ -161,6 +162,12 @@ def outer(options: TuneOptions) -> int:
         )
     code = _concluded(folder, options)
     return Exit.REJECTED if done.reason else code
+
+
+def _without_laser(config: Config) -> str:
+    if not config.by_optics:
+        return ""
+    return "the shape loop has nothing to follow: the figure itself is held (estimator.process_value)"
 
 
 def _to_be_tried(unfit: str, after_s: float, before_s: float, options: TuneOptions, progress: Progress) -> bool:
@@ -289,7 +296,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
         case "observe":
             weather = session.disturbance_of(folder)
             return (
-                f"laser noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
+                f"{'figure' if folder.config.by_optics else 'laser'} noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
                 f"scatters by {weather.unsteady:.0%}"
             )
         case "design":

@@ -2,14 +2,14 @@
 
 import contextlib
 import getpass
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
+from membrane_ctrl.hold.virtual_run import ShapeSource, TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.errors import DeviceError, InputError, writing
@@ -22,12 +22,6 @@ from tuning import choice
 from tuning.identification.characterise import FULL, SHORT, Plan
 from tuning.proposal.verify import STAGES
 from tuning.rig import HoldRig
-
-_WITHOUT_LASER = (
-    "tune reads a laser in every tick, and this hold uses none (estimator.process_value); it learns its noise levels "
-    "by itself, and pump_delay_s and pump_lag_s of [estimator] may be 30 % wrong"
-)
-
 
 @dataclass(frozen=True, slots=True)
 class TuneOptions:
@@ -73,12 +67,16 @@ def author_name() -> str:
 
 @contextlib.contextmanager
 def opened(
-    options: TuneOptions, fresh: bool = False, again: str = "resume it with `membrane-ctrl tune run --resume {}`"
+    options: TuneOptions,
+    fresh: bool = False,
+    again: str = "resume it with `membrane-ctrl tune run --resume {}`",
+    refusal: Callable[[Config], str] = lambda config: "",
 ) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
     """Yield a session's folder and hold; restore the last good gains if it ends early, and say how to go on."""
     progress = Progress()
     with linked(options) as link:
-        _require_laser(link.config)
+        if refused := refusal(link.config):
+            raise InputError(refused)
         folder = folder_of(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
         rig.good = folder.head.before, folder.config.pump
@@ -99,11 +97,6 @@ def opened(
                 raise
 
 
-def _require_laser(config: Config) -> None:
-    if config.by_optics:
-        raise InputError(_WITHOUT_LASER)
-
-
 def _go_back(rig: HoldRig, progress: Progress) -> None:
     progress.interrupted = False
     try:
@@ -118,7 +111,6 @@ def linked(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
     if not options.twin:
         return live_hold(options.where, options.take_over, wait=options.wait)
     config = open_session(options.session).config if options.session is not None else options.config
-    _require_laser(config)
     try:
         return contextlib.closing(TwinHold(config))
     except HoldError as error:
@@ -156,6 +148,8 @@ class TwinHold:
         Events applied to the bench.
     bench : VirtualBench, optional
         Another bench than the configured twin.
+    figures : callable, optional
+        Its figures of the mirror, if not the twin's truth.
 
     Attributes
     ----------
@@ -172,10 +166,13 @@ class TwinHold:
         config: Config,
         events: Sequence[surroundings.BenchEvent] = (),
         bench: virtual_bench.VirtualBench | None = None,
+        figures: ShapeSource | None = None,
     ) -> None:
         self.config = config
         self.bench = bench or virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
-        source = TruthShape(self.bench, config, config.twin.seed) if config.shape.enabled else None
+        source = figures
+        if source is None and config.shape.enabled:
+            source = TruthShape(self.bench, config, config.twin.seed)
         self._shapes: list[shape_estimate.ShapeEstimate] = []
 
         def shape(now_s: float) -> shape_estimate.ShapeEstimate | None:

@@ -192,7 +192,7 @@ def _returned(rig: HoldRig) -> bool:
     for _ in range(_BACK_MOST):
         rows = rig.ticks(_BACK_S)
         off_um = rig.record(rows).filled_displacement_um() - rows[-1].target_um - rows[-1].trim_um
-        if np.abs(off_um).reshape(6, -1).mean(axis=1)[3:].max() < _BACK_WITHIN_UM:
+        if max(part.mean() for part in np.array_split(np.abs(off_um), 6)[3:]) < _BACK_WITHIN_UM:
             return True
     return False
 

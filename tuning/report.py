@@ -61,7 +61,7 @@ def draw_weather(
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion")  # one-sided
     axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="motion not explained by weather sensors")
-    axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="laser noise")
+    axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="noise of a reading")
     axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
     axes.legend(loc="best")
     write_figure(users(path), figure, _DPI)
@@ -208,7 +208,7 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Laser noise {weather.laser_um:.3f} um per reading. Every predicted std rests on this "
+        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} um. Every predicted std rests on this "
         f"record: ten other minutes of weather like it change it by {weather.unsteady:.0%} (1 sigma), and its "
         "fit has an error.</p>",
         _image(folder, "weather.png"),

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import gas, inner_loop
 from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.controller.commands import Command
@@ -99,7 +99,7 @@ def laser_noise_um(record: Record) -> float:
     """
     steps_um = np.diff(record.displacement_um[np.isfinite(record.displacement_um)])
     if steps_um.size == 0:
-        raise ValueError("no laser reading in the record")
+        raise ValueError("no reading of the mirror in the record")
     return float(np.median(np.abs(steps_um)) / 0.6745 / math.sqrt(2))
 
 
@@ -107,6 +107,58 @@ def laser_noise_um(record: Record) -> float:
 #
 # Successive records have no gap: each starts with the tick after the last one taken, so that what happens
 # in between (a fit takes a second) is in the next record and not lost.
+
+_FIGURE_LATE_S = 1.5  # a figure takes 0.1 s; after this long, none shows the tick
+_WITHIN = 0.1  # of a tick: figures of about its time
+_FIGURES_APART_S = 0.4  # further apart, a line between them shows nothing
+
+
+class TicksByFigures:
+    """Gives the ticks of a hold without a laser the displacement that the figures show at their time.
+
+    A figure shows the mirror of some time before it arrives: a tick waits for the figures before and after it. In the
+    telemetry it has the last figure that had arrived by then.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._zero_um = 1e3 * config.optics.mirror.sag_mm
+        self._asked_s = 1 / config.shape.track_rate_hz
+        self._waiting: deque[telemetry.TelemetryRow] = deque()
+        self._shown: deque[tuple[float, float]] = deque([(-math.inf, math.nan)])  # time, displacement
+        self._intervals_s: list[float] = []
+
+    @property
+    def interval_s(self) -> float:
+        """Time between figures: as asked for, or the median so far if that is longer."""
+        return max(self._asked_s, float(np.median(self._intervals_s)) if self._intervals_s else 0.0)
+
+    def take(
+        self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]
+    ) -> list[telemetry.TelemetryRow]:
+        """Return the ticks that are complete, of these and earlier ones; NaN where no figure shows the mirror."""
+        self._waiting.extend(rows)
+        for shape in shapes:
+            newest_s = self._shown[-1][0]
+            if shape.verdict != "rejected" and shape.kind != "full" and shape.time_s > newest_s:
+                self._shown.append((shape.time_s, shape.sag_um - self._zero_um))
+                self._intervals_s += [shape.time_s - newest_s] if math.isfinite(newest_s) else []
+        done: list[telemetry.TelemetryRow] = []
+        while self._waiting and (
+            self._waiting[0].mono_s <= self._shown[-1][0]
+            or self._waiting[-1].mono_s - self._waiting[0].mono_s > _FIGURE_LATE_S
+        ):
+            row = self._waiting.popleft()
+            done.append(replace(row, displacement_um=self._at(row.mono_s)))
+        return done
+
+    def _at(self, time_s: float) -> float:
+        while len(self._shown) > 1 and self._shown[1][0] <= time_s:
+            self._shown.popleft()
+        (before_s, before_um), (after_s, after_um) = self._shown[0], self._shown[min(1, len(self._shown) - 1)]
+        if not before_s <= time_s <= after_s or after_s - before_s > _FIGURES_APART_S:
+            return math.nan
+        return before_um + (after_um - before_um) * (time_s - before_s) / max(after_s - before_s, 1e-9)
+
 
 Progress = Callable[[float], None]  # seconds of hold recorded since the last call
 _HELD = frozenset({telemetry.State.HOLD, telemetry.State.TUNE})
@@ -121,6 +173,9 @@ class HoldRig:
         self.seen: Callable[[telemetry.TelemetryRow], None] = lambda row: None  # each recorded tick
         self._rows: deque[telemetry.TelemetryRow] = deque()
         self._events: deque[events.Event] = deque()
+        self._figures = TicksByFigures(link.config) if link.config.by_optics else None
+        self._every = 0  # ticks of a reading; 0: not known yet
+        self._state = math.nan  # of the newest tick
         self.loop, self.pump = link.config.loop, link.config.pump  # as last set
         self.good = self.loop, self.pump  # to go back to
         self.dt_s = 1 / self.loop.rate_hz
@@ -139,7 +194,8 @@ class HoldRig:
         rows = self.ticks(duration_s)
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])
-        setpoints = np.interp(ticks[0] + np.arange(len(record)), ticks, [row.setpoint_um for row in rows])
+        read = ticks[0] + self._every * np.arange(len(record))
+        setpoints = np.interp(read, ticks, [row.setpoint_um for row in rows])
         return record, setpoints
 
     def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
@@ -199,7 +255,7 @@ class HoldRig:
     def end_experiment(self) -> None:
         """End the experiment that runs, perhaps that of a session that was killed, and discard its ticks."""
         self._take()
-        if not self._rows or self._rows[-1].state != telemetry.State.TUNE:
+        if self._state != telemetry.State.TUNE:
             return
         self._link.ask(Command("hold", self._who, "tuning session interrupted"))
         while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
@@ -214,7 +270,14 @@ class HoldRig:
         self._rows.clear()
 
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
-        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the flow."""
+        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the flow.
+
+        Without a laser there is a reading for each figure, and further ticks are taken until they are whole ones.
+        """
+        self._every = self._every or self._ticks_of_a_figure()
+        rows = list(rows)
+        while rows and round(rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1) % self._every:
+            rows.append(self._next_held())
         flows: list[float] = []
         samples: list[machine.BenchSample] = []
         flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
@@ -228,7 +291,10 @@ class HoldRig:
             flows.append(flow)
             samples.append(machine.BenchSample(row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c))
             tick = place + 1
-        return Record.from_samples(self.dt_s, flows, samples)
+        return Record.from_samples(self.dt_s, flows, samples).every(self._every)
+
+    def _ticks_of_a_figure(self) -> int:
+        return 1 if self._figures is None else max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
 
     def _next_held(self) -> telemetry.TelemetryRow:
         while not self._rows:
@@ -245,7 +311,8 @@ class HoldRig:
 
     def _take(self) -> None:
         news = self._link.news()
-        self._rows.extend(news.rows)
+        self._state = news.rows[-1].state if news.rows else self._state
+        self._rows.extend(news.rows if self._figures is None else self._figures.take(news.rows, news.shapes))
         self._events.extend(news.events)
         self.shapes += news.shapes
 

@@ -161,8 +161,9 @@ def estimator_of(session: folder.SessionFolder) -> dict[str, float]:
     levels = {
         "pump_delay_s": model.dead_time_s,
         "pump_lag_s": model.lag_s,
-        "laser_noise_um": seen.laser_um,
     }
+    if not session.config.by_optics:  # a figure states its own noise
+        levels["laser_noise_um"] = seen.laser_um
     for name, unit, walk, weather in (
         ("barometer", "pa", "pressure", seen.barometer),
         ("thermometer", "k", "air", seen.air),

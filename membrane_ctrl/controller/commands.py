@@ -117,7 +117,7 @@ def refusal(command: Command, state: State, config: Config) -> str:
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))
         return f"{command.kind} is not allowed in state {state.name.lower()}; allowed in {where}"
-    if command.kind in ("shape_off", "tune") and config.by_optics:
+    if command.kind == "shape_off" and config.by_optics:
         return "the mirror is held by the optics alone (estimator.process_value)"
     if command.kind == "setpoint":
         low, high = config.limits.displacement_min_um, config.limits.displacement_max_um

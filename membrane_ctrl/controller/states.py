@@ -128,7 +128,10 @@ def tune(scene: Scene) -> State:
     trial = scene.trial
     assert trial is not None  # made by the command that leads here
     given = _given(scene, scene.setpoint_um)
-    measurement = BenchSample(given.displacement_um, given.ambient_pressure_pa, given.air_temperature_c)
+    seen_um = given.displacement_um
+    if scene.config.by_optics and given.estimate is not None and math.isfinite(seen_um):
+        seen_um = given.estimate.um  # a figure is of a moment ago
+    measurement = BenchSample(seen_um, given.ambient_pressure_pa, given.air_temperature_c)
     wanted: float | Finished
     if scene.hold_wanted:
         wanted = Finished(False, f"ended by {scene.asked_by}")

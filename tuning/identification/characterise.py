@@ -82,7 +82,7 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
     refused: list[str] = []
     degraded: list[str] = []
     if record.lost_fraction > _LOST_MAX:
-        refused.append(f"{record.lost_fraction:.0%} of the laser's readings were lost: check the laser, repeat")
+        refused.append(f"{record.lost_fraction:.0%} of the readings were lost: check the laser (without one, the camera), repeat")
     if model.gain < _UNANSWERED * sigma.gain:
         refused.append(
             f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {MAP_THE_PUMP}"

@@ -38,7 +38,7 @@ class Record:
 
     dt_s: float  # sample time
     flow_um_per_s: Series  # (n,): commanded flow as the pump's nominal curve has it, from each reading until the next
-    displacement_um: Series  # (n,): laser readings; NaN where one was lost
+    displacement_um: Series  # (n,): by the laser, or the figures of a hold without one; NaN where one was lost
     ambient_pressure_pa: Series  # (n,): all NaN without the sensor
     air_temperature_c: Series  # (n,)
 
@@ -68,13 +68,20 @@ class Record:
 
     @property
     def lost_fraction(self) -> float:
-        """Share of laser readings that were lost."""
+        """Share of readings that were lost."""
         return float(np.mean(~np.isfinite(self.displacement_um)))
 
     def part(self, start_s: float, stop_s: float) -> Record:
         """The samples from `start_s` up to, but excluding, `stop_s`."""
         cut = slice(round(start_s / self.dt_s), round(stop_s / self.dt_s))
         return Record(self.dt_s, *(column[cut] for column in self._columns()))
+
+    def every(self, ticks: int) -> Record:
+        """One reading of so many, and the mean flow until the next one."""
+        whole = len(self) // ticks * ticks
+        flow_um_per_s, *read = (column[:whole] for column in self._columns())
+        means_um_per_s = flow_um_per_s.reshape(-1, ticks).mean(axis=1)
+        return Record(ticks * self.dt_s, means_um_per_s, *(column[::ticks] for column in read))
 
     def followed_by(self, *later: Record) -> Record:
         """Join this record and its continuation. Raises ValueError for different sample times."""
@@ -87,7 +94,7 @@ class Record:
         """Readings with lost ones interpolated. Raises ValueError if all are lost."""
         good = np.isfinite(self.displacement_um)
         if not good.any():
-            raise ValueError("no laser reading in the record")
+            raise ValueError("no reading of the mirror in the record")
         return np.interp(np.arange(len(self)), np.flatnonzero(good), self.displacement_um[good])
 
     def sha256(self) -> str:
