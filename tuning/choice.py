@@ -138,13 +138,26 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
 
 
 def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, yes: bool) -> int:
-    """Save the pump and the noise levels that a session measured: the loop of an estimate has no other gains."""
+    """Save the pump and the noise levels that a session measured: the loop of an estimate has no other gains.
+
+    With the pump's curve, if it measured one, come the gains that suit it, for a hold that begins on the laser.
+    """
     _require_same_devices(path, config, folder)
+    tables: dict[str, Section] = {}
+    if pump_trial.mapped(folder):
+        pump = folder.config.pump
+        if config.pump not in (pump, pump_trial.mapped_of(folder).before):
+            raise InputError(f"{path}: has another [pump] than the session began with: tune with this configuration")
+        keys = {*GAIN_KEYS, "flow_max_um_per_s"}
+        loop = config.loop.model_copy(update=folder.head.before.model_dump(include=keys))
+        tables = {"pump": pump, "loop": loop}
     known = config.estimator.model_dump() | session.estimator_of(folder)
     estimator = toml_file.parse(known, schema.EstimatorConfig, str(folder.path))
-    changed = {"estimator": _changes(config.estimator, estimator)}
-    if not changed["estimator"]:
-        print(f"{path} already has the noise levels of {folder.path.name}")
+    tables["estimator"] = estimator
+    require_sound(config.model_copy(update=tables), str(path))
+    changed = {name: _changes(getattr(config, name), table) for name, table in tables.items()}
+    if not any(changed.values()):
+        print(f"{path} already has what {folder.path.name} measured")
         return errors.Exit.DONE
     before = files.read_text(path, follow=True)
     _replaced(path, before, _with(before, changed, path), folder, yes)

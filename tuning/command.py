@@ -295,8 +295,9 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             )
         case "observe":
             weather = session.disturbance_of(folder)
+            what = "figure" if folder.config.by_optics else "laser"
             return (
-                f"{'figure' if folder.config.by_optics else 'laser'} noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
+                f"{what} noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
                 f"scatters by {weather.unsteady:.0%}"
             )
         case "design":

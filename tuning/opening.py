@@ -23,6 +23,7 @@ from tuning.identification.characterise import FULL, SHORT, Plan
 from tuning.proposal.verify import STAGES
 from tuning.rig import HoldRig
 
+
 @dataclass(frozen=True, slots=True)
 class TuneOptions:
     """Options of the command line."""

@@ -276,7 +276,10 @@ class HoldRig:
         """
         self._every = self._every or self._ticks_of_a_figure()
         rows = list(rows)
-        while rows and round(rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1) % self._every:
+        while (
+            rows
+            and round(rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1) % self._every
+        ):
             rows.append(self._next_held())
         flows: list[float] = []
         samples: list[machine.BenchSample] = []

@@ -158,10 +158,7 @@ _WALK_RAD_PER_S = 1.0  # where the estimate weighs the weather sensors against w
 def estimator_of(session: folder.SessionFolder) -> dict[str, float]:
     """What the session measured of `[estimator]`: the pump, and noise and unrest of the sensors that are there."""
     model, seen = found_of(session).identified.model, disturbance_of(session)
-    levels = {
-        "pump_delay_s": model.dead_time_s,
-        "pump_lag_s": model.lag_s,
-    }
+    levels = {"pump_delay_s": model.dead_time_s, "pump_lag_s": model.lag_s}
     if not session.config.by_optics:  # a figure states its own noise
         levels["laser_noise_um"] = seen.laser_um
     for name, unit, walk, weather in (

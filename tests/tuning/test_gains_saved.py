@@ -242,6 +242,22 @@ def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
     assert "already has" in capsys.readouterr().out
 
 
+def test_a_hold_by_the_estimate_is_given_the_curve_with_what_was_measured_of_the_sensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = TEXT + '[estimator]\nprocess_value = "estimate"\n'
+    session, path = mapped_session(tmp_path, text), tmp_path / "lab.toml"
+    monkeypatch.setattr("tuning.session.estimator_of", lambda folder: {"pump_delay_s": 1.1})
+    assert saved(path, str(session), "--yes", text=text) == Exit.DONE
+    now = load(path, Config)
+    assert (now.estimator.pump_delay_s, now.pump, now.loop.flow_max_um_per_s) == (1.1, CURVE, 6.0)
+    capsys.readouterr()
+    other = text + "[pump]\nflow_full_um_per_s = 9.0\n"
+    assert saved(path, str(session), "--yes", text=other) == Exit.BAD_INPUT
+    assert "has another [pump] than the session began with" in capsys.readouterr().err
+    assert path.read_text() == other
+
+
 def kept_time_constant(logs: Path, name: str = "outer", what: What = "kept") -> Path:
     """A session that tried a time constant of the shape loop and measured nothing else."""
     session = plain.create_session(logs, name, "eve", "a-run", Config(), BEFORE)

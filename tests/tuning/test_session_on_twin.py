@@ -249,7 +249,7 @@ def test_the_estimate_is_told_what_the_session_measured(
     assert saved == {"process_value": "estimate"} | changed
     capsys.readouterr()
     assert command_line(words) == Exit.DONE
-    assert "already has the noise levels" in capsys.readouterr().out
+    assert "already has what" in capsys.readouterr().out
 
 
 def test_gains_are_not_designed_for_a_loop_that_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,13 +261,28 @@ def test_gains_are_not_designed_for_a_loop_that_has_none(tmp_path: Path, capsys:
         tune._do_all(["apply"], made, None, None, Progress())  # type: ignore[arg-type]
 
 
-def test_a_hold_without_a_laser_is_not_tuned_and_told_what_it_needs_not(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = '[estimator]\nprocess_value = "optics"\n[shape]\nmode = "track"\n'
-    assert tune_twin(tmp_path / "logs", "run", "--yes", config=config) == Exit.BAD_INPUT
+BY_OPTICS = '[estimator]\nprocess_value = "optics"\n[shape]\nmode = "track"\n[twin]\nlaser = false\n'
+
+
+def test_a_hold_without_a_laser_is_tuned_by_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = BY_OPTICS + "pump_lag_s = 0.3\n[loop]\nrate_hz = 25.0\n"
+    assert tune_twin(tmp_path / "logs", "run", "--short", "--yes", config=config) == Exit.DONE
+    assert "figure noise 0.0" in capsys.readouterr().err
+    path = tmp_path / "lab.toml"
+    path.write_text(config)
+    assert (
+        command_line(["tune", "save", "--config", str(path), "--logs", str(tmp_path / "logs"), "--yes"]) == Exit.DONE
+    )
+    saved = tomllib.loads(path.read_text())["estimator"]
+    assert saved["pump_delay_s"] + saved["pump_lag_s"] == pytest.approx(0.375, abs=0.05)
+    assert "laser_noise_um" not in saved
+
+
+def test_without_a_laser_there_is_no_shape_loop_to_tune(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tune_twin(tmp_path / "logs", "outer", "--yes", config=BY_OPTICS) == Exit.BAD_INPUT
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "uses none (estimator.process_value); it learns its noise levels by itself" in line
+    assert line.endswith("has nothing to follow: the figure itself is held (estimator.process_value)")
+    assert not (tmp_path / "logs" / "tuning").exists()
 
 
 @pytest.mark.parametrize("name", ["experiments.npz", "experiments.json", "identified.json"])

@@ -82,7 +82,9 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
     refused: list[str] = []
     degraded: list[str] = []
     if record.lost_fraction > _LOST_MAX:
-        refused.append(f"{record.lost_fraction:.0%} of the readings were lost: check the laser (without one, the camera), repeat")
+        refused.append(
+            f"{record.lost_fraction:.0%} of the readings were lost: check the laser (without one, the camera), repeat"
+        )
     if model.gain < _UNANSWERED * sigma.gain:
         refused.append(
             f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {MAP_THE_PUMP}"
@@ -103,7 +105,10 @@ def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str
     if identified.whiteness_p < _P_MIN and model.gain > _STRONG:
         refused.append(f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?): {MAP_THE_PUMP}")
     elif identified.whiteness_p < _P_MIN:
-        degraded.append("the residuals are coloured: something periodic moves the mirror or the reading")
+        degraded.append(
+            "the residuals are coloured: something periodic moves the mirror or the reading, or the "
+            "weather is no random walk"
+        )
     return refused, degraded
 
 

@@ -161,7 +161,9 @@ class ExcursionGuard:
         """The experiment's step, then the way back, then the experiment's end."""
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:
-            lost = f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the camera), then repeat"
+            lost = (
+                f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the camera), then repeat"
+            )
             return self._ended or Finished(False, lost)
         off_um = self._motion.position_um - self._centre_um
         if self._ended is None:
