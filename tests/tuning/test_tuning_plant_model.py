@@ -46,7 +46,7 @@ def test_lost_readings_are_counted_and_bridged() -> None:
 
 def test_a_record_without_any_reading_is_refused() -> None:
     record = Record.from_samples(0.02, [1.0] * 3, [BenchSample(float("nan"))] * 3)
-    with pytest.raises(ValueError, match="no laser reading"):
+    with pytest.raises(ValueError, match="no reading of the mirror"):
         record.filled_displacement_um()
 
 
