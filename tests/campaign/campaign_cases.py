@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from campaign_times import GAUGE_STUCK_S, HOLD_FLOW_S, STALE_S, TICK_S
 
@@ -11,6 +11,9 @@ from membrane_ctrl.controller.commands import Kind
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
+
+
+_GUARD_S = 4.0  # an experiment's guard first tries to bring the mirror back
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ class Case:
             return self.always
         if self.holding is not None and state == State.HOLD:
             return self.holding
+        if self.holding is not None and state == State.TUNE:
+            return replace(self.holding, within_s=self.holding.within_s + _GUARD_S)
         return self.moving if state in MOVING else self.checking if state == State.CHECK else None
 
 
@@ -124,7 +129,8 @@ CASES: tuple[Case, ...] = (
     _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
     _case(
         "laser 200 um off",
-        f"{_LOST} displacement_jump following_error over_displacement under_displacement over_pressure actuator_test",
+        f"{_LOST} displacement_jump following_error over_displacement under_displacement over_pressure actuator_test "
+        "laser_gauge_apart",
         wrong={"laser_offset_um": -200},
         laser_lies=True,
         believed=True,

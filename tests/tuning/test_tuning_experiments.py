@@ -259,6 +259,17 @@ def test_after_its_end_an_experiment_brings_the_mirror_back_without_winding_up()
     assert lowest_um > -1.0
 
 
+def test_a_mirror_that_strays_on_the_way_back_is_given_to_the_loop_and_its_safety_rules() -> None:
+    """Behind an open vent the way back went on for 40 s, in which no rule tripped."""
+    guard = ExcursionGuard(Constant(), AROUND, 0.0, 50.0)
+    at_um, step = -9.5, guard.step(BenchSample(-9.5), 0.02)
+    while not isinstance(step, Finished):
+        at_um -= 0.02 * 5.0
+        step = guard.step(BenchSample(at_um), 0.02)
+    assert -22.0 < at_um < -19.0
+    assert "the limit of 10 um was near" in step.reason
+
+
 def test_a_raw_experiment_ends_where_it_is_and_one_without_readings_at_once() -> None:
     raw = ExcursionGuard(Constant(), AROUND, 0.0, 50.0, raw=True)
     assert isinstance(raw.step(BenchSample(9.5), 0.02), Finished)

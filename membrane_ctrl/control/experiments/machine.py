@@ -125,6 +125,7 @@ def quieted(around: Around, rate_hz: float) -> Around:
 _PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2 s late
 _BACK_SHARE = 0.2  # of the limit, within which the loop takes over
 _BACK_MOST_S = 40.0  # with a wrong holding flow the pull ends further off
+_STRAYED = 2.0  # limits: this far off something else moves the mirror, and the loop's safety rules are needed
 
 
 class ExcursionGuard:
@@ -135,8 +136,9 @@ class ExcursionGuard:
     remedy, if the margin uses up the limit.
 
     Back it goes on the holding flow with a weak pull: behind a curve other than the configured one, an integrator
-    would wind up on the way and carry the mirror further past the centre than the experiment may. An experiment that
-    sets raw commands (`raw`) ends where it is.
+    would wind up on the way and carry the mirror further past the centre than the experiment may. A mirror that
+    strays all the same, behind an open vent or a dead pump, is given to the loop at twice the limit. An experiment
+    that sets raw commands (`raw`) ends where it is.
     """
 
     def __init__(
@@ -172,7 +174,8 @@ class ExcursionGuard:
                 return found
             self._ended = found
         self._back_s += dt_s
-        if abs(off_um) < _BACK_SHARE * self._limit_um or self._back_s > _BACK_MOST_S:
+        back = abs(off_um) < _BACK_SHARE * self._limit_um
+        if back or self._back_s > _BACK_MOST_S or abs(off_um) > _STRAYED * self._limit_um:
             return self._ended
         back_um_per_s = self._around.holding_flow_um_per_s - _PULL_PER_S * off_um
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
