@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from membrane_ctrl.measure import sofast
+from membrane_ctrl.measure import measure as sofast
 from tests.support import sofast_facet
 
 h5py = pytest.importorskip("h5py")

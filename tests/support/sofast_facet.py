@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.measure.sofast import MM_PER_M, SHIFTS_RAD, SofastMeasurement, floats, item, open_file
+from membrane_ctrl.measure.measure import MM_PER_M, SHIFTS_RAD, SofastMeasurement, floats, item, open_file
 from membrane_ctrl.metrology.frames.series_integrity import Unwrapped, unwrap
 from membrane_ctrl.metrology.optics.geometry import Face, Geometry
 from membrane_ctrl.metrology.phase import phasors
