@@ -24,13 +24,20 @@ from membrane_ctrl.config.control import (
     ShapeConfig,
     StatesConfig,
 )
-from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
+from membrane_ctrl.config.optics import (
+    CameraConfig,
+    DisturbancesConfig,
+    GeometryConfig,
+    MirrorConfig,
+    OpticsConfig,
+    PatternConfig,
+)
 from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig, WebConfig
 
 __all__ = [
-    "CameraConfig", "Config", "DevicesConfig", "EstimatorConfig", "GeometryConfig", "LimitsConfig", "LoopConfig",
-    "MirrorConfig", "OpticsConfig", "PatternConfig", "PumpConfig", "RecordingConfig", "ResumeConfig", "ShapeConfig",
-    "StatesConfig", "TwinConfig",
+    "CameraConfig", "Config", "DevicesConfig", "DisturbancesConfig", "EstimatorConfig", "GeometryConfig",
+    "LimitsConfig", "LoopConfig", "MirrorConfig", "OpticsConfig", "PatternConfig", "PumpConfig", "RecordingConfig",
+    "ResumeConfig", "ShapeConfig", "StatesConfig", "TwinConfig",
 ]  # fmt: skip
 
 ROLES = ("displacement", "pump", "gauge_pressure", "vent", "barometer", "thermometer")
@@ -161,6 +168,7 @@ class TwinConfig(Section):
     """Modulus times thickness of the film, for the pressure that `simulate` states. Change it to try `film`."""
     drum_nm: Annotated[float, Field(ge=0, le=1e4)] = 0.0
     """Amplitude of each vibration of the film, at 27, 48, 57 and 61 Hz, in its pictures. Change it to try `modes`."""
+    disturbances: DisturbancesConfig = DisturbancesConfig()
     geometry: GeometryConfig | None = None  # true camera and screen poses; none: those of [optics.geometry]
 
 

@@ -90,6 +90,8 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     return replace(
         _bare(options, optics, mounted if options.figure else replace(mounted, zernike_um=())),
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
+        disturbances=twin.disturbances,
+        drum_nm=twin.drum_nm,
         motion=options.motion,
         laser_noise_um=options.laser_noise_um,
     )

@@ -19,7 +19,8 @@ from membrane_ctrl.metrology.track.tracked import rejected_frame
 from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.film_shape import DRUM_MODES, typical_film
+from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
+from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from membrane_ctrl.sim.plant import Plant
 from tests.support.virtual_record import run_virtual

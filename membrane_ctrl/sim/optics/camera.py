@@ -10,9 +10,10 @@ from typing import Protocol
 import numpy as np
 
 from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
-from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
+from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics.film_shape import DRUM_MODES, DrumMode, FilmShape, FilmTerms, typical_film
+from membrane_ctrl.sim.optics.disturbances import Bench, Disturber, DrumMode, drummed
+from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms, typical_film
 from membrane_ctrl.sim.optics.shade import (
     Light,
     cubic_weights,
@@ -22,6 +23,7 @@ from membrane_ctrl.sim.optics.shade import (
     normal_quantiles,
     shade,
     shade_crossed,
+    vignetting,
 )
 from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
 
@@ -51,6 +53,8 @@ class OpticsRenderer:
     exact: bool = False
     seed: int = 0
     modes: tuple[DrumMode, ...] = ()
+    disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
+    _disturber: Disturber | None = field(default=None, init=False, repr=False)
     _traces: OrderedDict[float, FloatArray] = field(default_factory=OrderedDict, init=False, repr=False)
     _swings: dict[DrumMode, FloatArray] = field(default_factory=dict, init=False, repr=False)
     _pictures: int = field(default=0, init=False, repr=False)
@@ -70,7 +74,10 @@ class OpticsRenderer:
         self._rows = node_positions(camera.height_px, self._step)
         columns, rows = np.meshgrid(self._columns, self._rows)
         self._directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
-        self._loss = _vignetting(camera.width_px, camera.height_px, self.light.vignetting)
+        self._side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm  # of the pattern's region
+        self._loss = vignetting(camera.width_px, camera.height_px, self.light.vignetting)
+        if self.disturbances != DisturbancesConfig():
+            self._disturber = self._disturbed()
 
     def blank(self) -> Pixels:
         """An empty picture, (H, W): uint8 for an 8-bit camera, uint16 for any deeper one."""
@@ -101,10 +108,13 @@ class OpticsRenderer:
             )
         self._pictures += 1
         paint = self._crossed(pattern, gain) if pattern.role == "crossed" else self._striped(pattern, gain)
-        nodes = self._nodes(displacement_um)
+        nodes, times_s = self._nodes(displacement_um), np.array([[time_s]])
+        if self._disturber is not None:
+            nodes, times_s = nodes + self._disturber.rays(time_s), self._disturber.row_times_s(time_s)
         for mode in self.modes:
-            swing_um = mode.amplitude_nm / 1e3 * np.sin(2 * np.pi * mode.frequency_hz * time_s + mode.lobes)
-            nodes = nodes + swing_um * self._swing_maps(mode)
+            nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
+        if self._disturber is not None:
+            nodes = np.concatenate([nodes, self._disturber.light(time_s, pattern)])
         seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
         other = _second_hand().submit(paint, nodes, seed, picture, middle, camera.height_px)
@@ -124,7 +134,7 @@ class OpticsRenderer:
                 self._weights,
                 int(pattern.axis == "y"),
                 self.film.radius_mm,
-                config.periods * config.period_mm,
+                self._side_mm,
                 (table.values, table.cell_mm, table.smooth),
                 np.array([dark, white, self.light.leak, full]),
                 self._loss,
@@ -138,11 +148,10 @@ class OpticsRenderer:
 
     def _crossed(self, pattern: Pattern, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of crossed fringes."""
-        side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm
         if pattern.index < 1:
             raise ValueError(f"pattern {pattern.name!r}: crossed fringes need 1 or more periods")
         first = (shift_rad / (2 * np.pi) - 0.5 for shift_rad in (pattern.shift_rad, pattern.shift_y_rad))
-        shape: tuple[float, ...] = pattern.index / side_mm, *first, side_mm / 2, self.film.radius_mm**2
+        shape: tuple[float, ...] = pattern.index / self._side_mm, *first, self._side_mm / 2, self.film.radius_mm**2
         dark, white, full = self._levels(gain)
         scale: tuple[float, ...] = dark, white, self.light.leak, self.light.gamma, self.optics.camera.noise_adu, full
         columns, rows = (loss.astype(np.float32) for loss in self._loss)
@@ -203,9 +212,22 @@ class OpticsRenderer:
             self._swings[mode] = moved - still
         return self._swings[mode]
 
+    def _disturbed(self) -> Disturber:
+        """The disturbances, for the nodes of a film at displacement 0."""
+        pose, still = self._camera_pose, self._trace(self._directions, 0.0)
+        self._camera_pose = replace(pose, position_mm=pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm)))
+        maps, grown = (self._maps(found) for found in (still, self._trace(self._directions, 0.0)))
+        self._camera_pose = pose
+        x_mm, y_mm = (place.reshape(maps.shape[1:]) for place in (still.x_mm, still.y_mm))
+        row_share = (self._rows + 0.5) / self.optics.camera.height_px - 0.5
+        full = self._levels(1.0)[2]
+        places = maps[0], maps[1], x_mm, y_mm, row_share
+        bench = Bench(*places, self._side_mm, self.film.radius_mm, full, grown - maps)
+        return Disturber(self.disturbances, bench, self.seed)
+
     def _maps(self, found: Trace) -> FloatArray:
         """Screen point from the region's low edges, squared distance from the vertex: (3, rows, columns)."""
-        half_side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm / 2.0
+        half_side_mm = self._side_mm / 2.0
         maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
         return maps.reshape(3, len(self._rows), len(self._columns))
 
@@ -214,13 +236,6 @@ class OpticsRenderer:
 def _second_hand() -> ThreadPoolExecutor:
     """A thread that shades half of each picture."""
     return ThreadPoolExecutor(1, "shade")
-
-
-def _vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
-    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of the corner)^2."""
-    columns, rows = np.arange(width_px) - (width_px - 1) / 2.0, np.arange(height_px) - (height_px - 1) / 2.0
-    per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
-    return per_px2 * columns**2, per_px2 * rows**2
 
 
 class FilmPosition(Protocol):
@@ -296,10 +311,13 @@ class TwinOptics:
             film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed, *material)
             stated = self._optics.geometry.reference_displacement_um
             reference_um = position.displacement_um if stated is None else stated
-            swing_nm = self._twin.drum_nm
-            modes = tuple(replace(mode, amplitude_nm=swing_nm) for mode in DRUM_MODES) if swing_nm else ()
             self._renderer = OpticsRenderer(
-                self._optics, film, reference_um=reference_um, seed=self._seed, modes=modes
+                self._optics,
+                film,
+                reference_um=reference_um,
+                seed=self._seed,
+                modes=drummed(self._twin.drum_nm),
+                disturbances=self._twin.disturbances,
             )
         return self._renderer
 

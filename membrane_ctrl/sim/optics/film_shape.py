@@ -301,36 +301,6 @@ def _terms(film: FilmShape) -> FilmTerms:
     return raised._replace(offset_mm=vertex_mm)
 
 
-@dataclass(frozen=True, slots=True)
-class DrumMode:
-    """A vibration: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
-
-    frequency_hz: float
-    lobes: int  # m
-    circles: int  # n
-    amplitude_nm: float = 1.0  # RMS over the mirror
-
-    def moved(self, film: FilmShape) -> FilmTerms:
-        """The film displaced by 1 um RMS, its ring at rest."""
-        from scipy import special
-
-        m, terms, zero = self.lobes, film.terms_at(0.0), special.jn_zeros(self.lobes, self.circles)[-1]
-        rms = abs(special.jv(m + 1, zero)) * (sqrt(0.5) if m else 1.0)
-        poly_mm = np.zeros((2 * _SERIES + m + 1,) * 2)
-        poly_mm[: terms.poly_mm.shape[0], : terms.poly_mm.shape[1]] = terms.poly_mm
-        for k in range(_SERIES + 1):
-            part_mm = 1e-3 / rms * (-1) ** k * (zero / 2) ** (2 * k + m) / (factorial(k) * factorial(k + m))
-            for p, q in np.ndindex(k + 1, m // 2 + 1):  # (x^2 + y^2)^k Re (x + i y)^m
-                poly_mm[2 * (k - p + m // 2 - q) + m % 2, 2 * (p + q)] += (
-                    part_mm * comb(k, p) * comb(m, 2 * q) * (-1) ** q
-                )
-        return terms._replace(poly_mm=poly_mm)
-
-
-_SERIES = 12  # powers of (r / radius)^2: J_0 and J_2 to 1e-6 beyond their second zeros
-DRUM_MODES = (DrumMode(27.0, 0, 1), DrumMode(48.0, 1, 1), DrumMode(57.0, 2, 1), DrumMode(61.0, 0, 2))
-
-
 def typical_film(
     sag_mm: float, radius_mm: float, seed: int, prestrain: float = 0.0, poisson: float = gas_film.POISSON_PET
 ) -> FilmShape:

@@ -38,6 +38,13 @@ def cubic_weights(step: int) -> FloatArray:
     )
 
 
+def vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
+    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of the corner)^2."""
+    columns, rows = np.arange(width_px) - (width_px - 1) / 2.0, np.arange(height_px) - (height_px - 1) / 2.0
+    per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
+    return per_px2 * columns**2, per_px2 * rows**2
+
+
 @cache
 def normal_quantiles() -> Singles:
     """65536 equally likely values of a unit normal distribution: 16 random bits pick one."""
@@ -88,7 +95,8 @@ def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray | Singles,
 
 @njit(cache=True, nogil=True)
 def shade(
-    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2)
+    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2); a
+    # disturbed bench has two more: factor of the screen's light, and counts of the room's
     nodes: FloatArray,
     weights: FloatArray,  # (step, 4) of `cubic_weights`
     axis: int,  # 0: the pattern runs along s_x, 1: along s_y
@@ -112,6 +120,8 @@ def shade(
     radius2_mm2 = radius_mm * radius_mm
     # three arrays, not rows of one: a view taken per pixel costs more than the pixel
     line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
+    line_factor, line_room = np.ones(nodes.shape[2]), np.zeros(nodes.shape[2])
+    disturbed = nodes.shape[0] > 3
     bits = np.uint64(0)
     for row in range(start, stop):
         # as if all rows before it had been shaded by the same hand
@@ -119,6 +129,9 @@ def shade(
         _row_of_nodes(nodes, 0, row // step, weights[row % step], line_x)
         _row_of_nodes(nodes, 1, row // step, weights[row % step], line_y)
         _row_of_nodes(nodes, 2, row // step, weights[row % step], line_r2)
+        if disturbed:
+            _row_of_nodes(nodes, 3, row // step, weights[row % step], line_factor)
+            _row_of_nodes(nodes, 4, row // step, weights[row % step], line_room)
         for cell in range((width + step - 1) // step):
             for k in range(min(step, width - cell * step)):
                 column = cell * step + k
@@ -129,6 +142,9 @@ def shade(
                     light = leak
                     if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
                         light = _level(s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth)
+                    if disturbed:
+                        light *= _between(line_factor, cell, weights, k)
+                        counts += _between(line_room, cell, weights, k)
                     counts += white * light * (1.0 - column_loss[column] - row_loss[row])
                 if sigma > 0.0:
                     if column & 3 == 0:  # four 16-bit numbers from each 64-bit one
@@ -163,9 +179,9 @@ def _cosine(turns: float) -> float:
 
 @njit(cache=True, fastmath=True)
 def _crossed_pixels(  # type: ignore[no-untyped-def]
-    lines, weights, loss, noise, pattern, scale, levels, counts
+    lines, weights, loss, noise, pattern, scale, levels, rooms, counts
 ):
-    """Levels and counts of the pixels (cells,) at one place between their nodes, of a row; `lines` are its nodes."""
+    """Levels, room light and counts of the pixels (cells,) at one place between their nodes, `lines`, of a row."""
     w0, w1, w2, w3 = weights
     rate, first_x, first_y, half_mm, radius2_mm2 = pattern
     dark, white, leak, gamma, sigma, full, row_loss = scale
@@ -178,12 +194,18 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
         inside = (abs(x - half_mm) < half_mm) & (abs(y - half_mm) < half_mm)
         levels[c] = level if inside else none
         counts[c] = white if r2 <= radius2_mm2 else none
+    if lines.shape[0] > 3:
+        for c in range(counts.size):
+            factor = w0 * lines[3, c] + w1 * lines[3, c + 1] + w2 * lines[3, c + 2] + w3 * lines[3, c + 3]
+            room = w0 * lines[4, c] + w1 * lines[4, c + 1] + w2 * lines[4, c + 2] + w3 * lines[4, c + 3]
+            rooms[c] = room if counts[c] > none else none
+            counts[c] *= factor
     if gamma != one:  # a power costs ten times the rest, and does not go many at a time
         for c in range(counts.size):
             levels[c] = max(levels[c], none) ** gamma
     for c in range(counts.size):
         light = (leak + (one - leak) * levels[c]) * (one - loss[c] - row_loss)
-        seen = dark + counts[c] * light + sigma * noise[c] + _FLOAT(0.5)
+        seen = dark + rooms[c] + counts[c] * light + sigma * noise[c] + _FLOAT(0.5)
         seen = seen if seen > none else none
         counts[c] = seen if seen < full else full
 
@@ -207,17 +229,17 @@ def shade_crossed(
     column_loss, row_loss = loss
     cells = column_loss.shape[1]
     bank, seed = noise
-    lines = np.empty((3, nodes.shape[2]), np.float32)
-    levels, counts = np.empty(cells, np.float32), np.empty(cells, np.float32)
+    lines = np.empty((nodes.shape[0], nodes.shape[2]), np.float32)
+    levels, rooms, counts = np.empty(cells, np.float32), np.zeros(cells, np.float32), np.empty(cells, np.float32)
     for row in range(start, stop):
-        for k in range(3):
+        for k in range(nodes.shape[0]):
             _row_of_nodes(nodes, k, row // step, weights[:, row % step], lines[k])
         bits = _random_64(np.uint64(seed) * _MIX_1 + np.uint64(row) * _GOLDEN)
         first = int(bits % np.uint64(bank.size - step * cells))
         for k in range(step):
             own = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
             some = bank[first + k * cells : first + (k + 1) * cells]
-            _crossed_pixels(lines, own, column_loss[k], some, pattern, (*scale, row_loss[row]), levels, counts)
+            _crossed_pixels(lines, own, column_loss[k], some, pattern, (*scale, row_loss[row]), levels, rooms, counts)
             for cell in range((width - k + step - 1) // step):
                 out[row, cell * step + k] = np.int32(counts[cell])
 

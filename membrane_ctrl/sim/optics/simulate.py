@@ -13,6 +13,7 @@ import tomli_w
 from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.disturbances import drummed
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 from membrane_ctrl.sim.optics.trace import Trace, onto_face
 
@@ -126,6 +127,7 @@ class _Exposure:
 
     pattern: roles.Pattern
     displacement_um: float
+    time_s: float
     gain: float = 1.0
 
 
@@ -182,7 +184,8 @@ def simulate_track(
     """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock and motion.
 
     The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`, `sag_um` (frames,)
-    and, if 36 terms represent the film, `coeffs_um` (frames, 36). `on_frame` gets the number of frames written.
+    and, if 36 terms represent the film, `coeffs_um` (frames, 36), all without the vibrations, `drum_um` (frames,
+    modes): RMS over the mirror. `on_frame` gets the number of frames written.
     Raises ValueError for frames or a rate that are not above 0, and for a specification that is not of a full set.
     """
     if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:
@@ -203,7 +206,7 @@ def simulate_track(
         row |= {"shift_x_rad": shift_x, "shift_y_rad": shift_y, "time_s": round(float(time_s[k]), 9)}
         if spec.laser:
             row["displacement_um"] = float(displacement_um[k] + noise_um[k])
-        _write_png(target / row["file"], renderer.render(pattern, float(displacement_um[k])))
+        _write_png(target / row["file"], renderer.render(pattern, float(displacement_um[k]), time_s=float(time_s[k])))
         rows.append(row)
         if on_frame is not None:
             on_frame(k + 1)
@@ -217,6 +220,8 @@ def simulate_track(
     coeffs = [spec.film.coeffs_um(float(d)) for d in displacement_um]
     if coeffs[0] is not None:
         truth["coeffs_um"] = np.array(coeffs)
+    if renderer.modes:
+        truth["drum_um"] = np.stack([mode.swing_um(time_s) for mode in renderer.modes], axis=1)
     np.savez_compressed(target / "truth.npz", **truth)
 
 
@@ -241,7 +246,15 @@ class _SeenDirectly(OpticsRenderer):
 def _renderer(spec: SimulationSpec) -> OpticsRenderer:
     kind = _SeenDirectly if spec.artefact.get("form") == "screen" else OpticsRenderer
     return kind(
-        spec.optics, spec.film, spec.light, spec.reference_um, spec.screen_error, exact=spec.exact, seed=spec.seed
+        spec.optics,
+        spec.film,
+        spec.light,
+        spec.reference_um,
+        spec.screen_error,
+        exact=spec.exact,
+        seed=spec.seed,
+        modes=drummed(spec.drum_nm),
+        disturbances=spec.disturbances,
     )
 
 
@@ -255,7 +268,8 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
         else:
-            picture = renderer.render(exposure.pattern, exposure.displacement_um, gain=exposure.gain)
+            um, gain = exposure.displacement_um, exposure.gain
+            picture = renderer.render(exposure.pattern, um, gain=gain, time_s=exposure.time_s)
         before = picture
         if ("wrong_size", pattern.name) in faults:
             picture = picture[:-1]
@@ -269,7 +283,10 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
 
 def _exposures(spec: SimulationSpec) -> list[_Exposure]:
     """The true pattern, film position and exposure time of each frame."""
-    exposures = [_Exposure(pattern, spec.displacement_um(frame)) for frame, pattern in enumerate(spec.patterns)]
+    exposures = [
+        _Exposure(pattern, spec.displacement_um(frame), spec.time_s(frame))
+        for frame, pattern in enumerate(spec.patterns)
+    ]
     place = {pattern.name: frame for frame, pattern in enumerate(spec.patterns)}
     for fault in spec.faults:
         frame = place[fault.frame]

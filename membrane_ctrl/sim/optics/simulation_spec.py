@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.config.schema import DisturbancesConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
 from membrane_ctrl.sim.optics import film_shape, shade, trace
@@ -129,6 +129,8 @@ class SimulationSpec:
     stated_geometry: GeometryConfig | None = None  # geometry in `capture.toml` if not the true one
     light: shade.Light = field(default_factory=shade.Light)
     screen_error: trace.ScreenError | None = None
+    disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
+    drum_nm: float = 0.0  # amplitude of each of the film's vibrations
     exact: bool = False
     seed: int = 1
     artefact: Mapping[str, str | float] = field(default_factory=dict)  # `[artefact]` of a set that shows one

@@ -13,10 +13,9 @@ from scipy.special import jn_zeros, jv
 
 from membrane_ctrl.metrology.optics.film_law import FilmLaw, finite_rise_mm
 from membrane_ctrl.sim import film as hencky
+from membrane_ctrl.sim.optics.disturbances import DRUM_MODES, DrumMode
 from membrane_ctrl.sim.optics.film_shape import (
-    DRUM_MODES,
     Bump,
-    DrumMode,
     FilmShape,
     Ripple,
     Wrinkle,
