@@ -270,15 +270,15 @@ Share = Annotated[float, Field(ge=0, le=0.5)]
 class DisturbancesConfig(Section):
     """What disturbs the twin's pictures, and those of `simulate`: amplitudes; 0 switches an effect off."""
 
-    brightness: Share = 0.0
-    """Wandering of the screen's light, in waves of 75 mm within a minute. A monochrome camera sees colour as this."""
-    dimming_per_h: Share = 0.0
+    brightness_fraction: Share = 0.0
+    """Wandering of the screen's light, RMS, in waves of 75 mm. Raise it to see changing light or colour."""
+    dimming_fraction_per_h: Share = 0.0
     """Share of the screen's light that is lost in an hour. Raise it to see an ageing backlight."""
     ambient_fraction: Share = 0.0
     """Room light on the mirror, of full scale, with a slope and a swing. Raise it to see an unshaded bench."""
     backlight_hz: Annotated[float, Field(ge=0, le=1e5)] = 0.0
     """Pulses of the screen's backlight; 0: steady. Set it to your screen's to see what an exposure of 20 ms sees."""
-    sticking: Share = 0.0
+    sticking_fraction: Share = 0.0
     """Light lost where the panel has shown white for hours. Raise it to see a picture that sticks."""
     dust: Annotated[int, Field(ge=0, le=1000)] = 0
     """Spots on the mirror, elsewhere every 25 s. Raise it to see a dusty room."""

@@ -25,7 +25,7 @@ from membrane_ctrl.model.errors import InputError
 _ADVICE = re.compile(r"(?<=[.;?])\s+(?=(?:Change|Leave|Lower|Raise|Set)\b)")
 _UNITS = {
     "adu": "counts", "baud": "Bd", "bits": "bits", "bytes": "bytes", "cycles": "cycles", "day": "day", "days": "days",
-    "db": "dB", "deg": "deg", "fraction": "1", "gb": "GB", "hz": "Hz", "k": "K", "khz": "kHz", "mb": "MB",
+    "db": "dB", "deg": "deg", "fraction": "1", "gb": "GB", "h": "h", "hz": "Hz", "k": "K", "khz": "kHz", "mb": "MB",
     "m": "m", "min": "min", "mm": "mm", "ms": "ms", "mw": "mW", "n": "N", "nm": "nm", "pa": "Pa", "px": "px",
     "s": "s", "s2": "s2", "um": "um",
 }  # fmt: skip

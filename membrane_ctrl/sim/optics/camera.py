@@ -12,7 +12,7 @@ import numpy as np
 from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics.disturbances import Bench, Disturber, DrumMode, drummed
+from membrane_ctrl.sim.optics.disturbances import Disturber, DrumMode, Nodes, drummed
 from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms, typical_film
 from membrane_ctrl.sim.optics.shade import (
     Light,
@@ -222,8 +222,8 @@ class OpticsRenderer:
         row_share = (self._rows + 0.5) / self.optics.camera.height_px - 0.5
         full = self._levels(1.0)[2]
         places = maps[0], maps[1], x_mm, y_mm, row_share
-        bench = Bench(*places, self._side_mm, self.film.radius_mm, full, grown - maps)
-        return Disturber(self.disturbances, bench, self.seed)
+        nodes = Nodes(*places, self._side_mm, self.film.radius_mm, full, grown - maps)
+        return Disturber(self.disturbances, nodes, self.seed)
 
     def _maps(self, found: Trace) -> FloatArray:
         """Screen point from the region's low edges, squared distance from the vertex: (3, rows, columns)."""

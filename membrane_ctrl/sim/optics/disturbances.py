@@ -94,7 +94,7 @@ class Waves:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Nodes:
     """Where the nodes of a picture are, on a bench at rest; maps are (rows, columns)."""
 
     s_x_mm: FloatArray  # on the screen, from the low edge of the pattern's region
@@ -111,54 +111,54 @@ class Bench:
 class Disturber:
     """The disturbances of one bench, picture after picture. Equal seeds and times give equal pictures."""
 
-    def __init__(self, wanted: DisturbancesConfig, bench: Bench, seed: int) -> None:
-        self._wanted, self._bench, self._seed = wanted, bench, seed
+    def __init__(self, wanted: DisturbancesConfig, nodes: Nodes, seed: int) -> None:
+        self._wanted, self._nodes, self._seed = wanted, nodes, seed
         rngs = [np.random.default_rng([seed, k]) for k in range(3)]
-        self._bright = Waves(_BRIGHT_MM, _BRIGHT_S, bench.side_mm / 2, rngs[0])
-        self._air = [Waves(_AIR_MM, _AIR_S, bench.radius_mm, rng) for rng in rngs[1:]]
-        self._dust = (-1, np.ones_like(bench.x_mm))  # since which change, and what it lets through
+        self._bright = Waves(_BRIGHT_MM, _BRIGHT_S, nodes.side_mm / 2, rngs[0])
+        self._air = [Waves(_AIR_MM, _AIR_S, nodes.radius_mm, rng) for rng in rngs[1:]]
+        self._dust = (-1, np.ones_like(nodes.x_mm))  # since which change, and what it lets through
         self._burnt, self._shown_s = np.zeros(2, complex), 0.0
 
     def row_times_s(self, time_s: float) -> FloatArray:
         """Middle of the exposure of each row of nodes, (rows, 1)."""
-        return time_s + self._wanted.rolling_s * self._bench.row_share[:, None]
+        return time_s + self._wanted.rolling_s * self._nodes.row_share[:, None]
 
     def rays(self, time_s: float) -> FloatArray:
         """What to add to the renderer's maps, (3, rows, columns): the stand's growth, and air that bends the rays."""
-        wanted, bench = self._wanted, self._bench
+        wanted, nodes = self._wanted, self._nodes
         warm_k = wanted.stand_k * math.sin(2 * math.pi * time_s / _WARMS_S)
-        moved = _GROWTH_MM_PER_K * warm_k * bench.grown
+        moved = _GROWTH_MM_PER_K * warm_k * nodes.grown
         if wanted.seeing_um:
             for k, air in enumerate(self._air):
-                moved[k] += 1e-3 * wanted.seeing_um * air.at(time_s, bench.x_mm, bench.y_mm)
+                moved[k] += 1e-3 * wanted.seeing_um * air.at(time_s, nodes.x_mm, nodes.y_mm)
         return moved
 
     def light(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
-        wanted, bench = self._wanted, self._bench
+        wanted, nodes = self._wanted, self._nodes
         factor = self._dust_at(time_s) * self._backlight(self.row_times_s(time_s))
-        factor = factor * math.exp(-wanted.dimming_per_h * time_s / 3600.0)
-        if wanted.brightness:
-            half_mm = bench.side_mm / 2
-            factor *= 1.0 + wanted.brightness * self._bright.at(
-                time_s, bench.s_x_mm - half_mm, bench.s_y_mm - half_mm
+        factor = factor * math.exp(-wanted.dimming_fraction_per_h * time_s / 3600.0)
+        if wanted.brightness_fraction:
+            half_mm = nodes.side_mm / 2
+            factor *= 1.0 + wanted.brightness_fraction * self._bright.at(
+                time_s, nodes.s_x_mm - half_mm, nodes.s_y_mm - half_mm
             )
-        if wanted.sticking and pattern.role == "crossed":
-            factor *= 1.0 - wanted.sticking * self._stuck(time_s, pattern)
+        if wanted.sticking_fraction and pattern.role == "crossed":
+            factor *= 1.0 - wanted.sticking_fraction * self._stuck(time_s, pattern)
         swing = _SWING * math.sin(2 * math.pi * time_s / _SWING_S)
-        room_adu = wanted.ambient_fraction * bench.full_adu * (1.0 + _SLOPE * bench.x_mm / bench.radius_mm + swing)
+        room_adu = wanted.ambient_fraction * nodes.full_adu * (1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing)
         return np.stack([factor, room_adu])
 
     def _dust_at(self, time_s: float) -> FloatArray:
         """Share of light that passes; the spots lie elsewhere every now and then."""
-        bench, change = self._bench, math.floor(time_s / _DUST_S)
+        nodes, change = self._nodes, math.floor(time_s / _DUST_S)
         if self._wanted.dust and self._dust[0] != change:
             places_mm = np.random.default_rng([self._seed, 3, change % 2**32]).uniform(
-                -bench.radius_mm, bench.radius_mm, (self._wanted.dust, 2)
+                -nodes.radius_mm, nodes.radius_mm, (self._wanted.dust, 2)
             )
-            passes = np.ones_like(bench.x_mm)
+            passes = np.ones_like(nodes.x_mm)
             for x_mm, y_mm in places_mm:
-                away2_mm2 = (bench.x_mm - x_mm) ** 2 + (bench.y_mm - y_mm) ** 2
+                away2_mm2 = (nodes.x_mm - x_mm) ** 2 + (nodes.y_mm - y_mm) ** 2
                 passes *= 1.0 - _DUST_LOSS * np.exp(-away2_mm2 / (2 * _DUST_MM**2))
             self._dust = change, passes
         return self._dust[1].copy()
@@ -179,11 +179,11 @@ class Disturber:
 
     def _stuck(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Level, 0 to 1, of the picture that the panel remembers: the mean of the patterns shown so far."""
-        bench = self._bench
+        nodes = self._nodes
         now = np.exp(1j * np.array([pattern.shift_rad, pattern.shift_y_rad]))
         keep = math.exp(min(0.0, self._shown_s - time_s) / _STICKING_S)
         self._burnt, self._shown_s = keep * self._burnt + (1.0 - keep) * now, time_s
-        rate = 2 * math.pi * pattern.index / bench.side_mm
+        rate = 2 * math.pi * pattern.index / nodes.side_mm
         waves = [np.real(burnt * np.exp(1j * (rate * s_mm - math.pi)))
-                 for burnt, s_mm in zip(self._burnt, (bench.s_x_mm, bench.s_y_mm), strict=True)]  # fmt: skip
+                 for burnt, s_mm in zip(self._burnt, (nodes.s_x_mm, nodes.s_y_mm), strict=True)]  # fmt: skip
         return np.asarray(0.5 + 0.25 * (waves[0] + waves[1]))

@@ -51,7 +51,7 @@ def gain(film: FilmShape, renderer: OpticsRenderer, pattern: Pattern, time_s: fl
 
 
 def test_brightness_wanders_in_space_and_within_minutes(film: FilmShape) -> None:
-    renderer = bench(film, brightness=0.02)
+    renderer = bench(film, brightness_fraction=0.02)
     fields = np.array([gain(film, renderer, WHITE, t) - 1 for t in (0.0, 1.0, *np.arange(300.0, 9000.0, 300.0))])
     assert fields.std() == pytest.approx(0.02, rel=0.25)
     assert fields[0].std() > 0.006  # in space, not as a whole
@@ -70,7 +70,9 @@ def test_waves_are_as_long_as_asked_and_forget_themselves(length_mm: float) -> N
 
 
 def test_the_screen_dims_by_the_share_of_an_hour(film: FilmShape) -> None:
-    assert gain(film, bench(film, dimming_per_h=0.1), WHITE, 1800.0) == pytest.approx(math.exp(-0.05), abs=1e-3)
+    assert gain(film, bench(film, dimming_fraction_per_h=0.1), WHITE, 1800.0) == pytest.approx(
+        math.exp(-0.05), abs=1e-3
+    )
 
 
 def test_room_light_falls_on_the_mirror_only_and_more_on_one_side(film: FilmShape) -> None:
@@ -94,7 +96,7 @@ def test_pulses_of_the_backlight_show_as_stripes_of_a_rolling_shutter(
 
 
 def test_a_panel_keeps_what_it_has_shown_for_hours(film: FilmShape) -> None:
-    renderer = bench(film, sticking=0.05)
+    renderer = bench(film, sticking_fraction=0.05)
     assert gain(film, renderer, crossed(), 0.0) == pytest.approx(0.975, abs=1e-3)  # of nothing yet: half of it
     after = gain(film, renderer, crossed(), 36_000.0)
     level = bench(film).render(crossed(), 0.0)[lit(film) & (bench(film).render(crossed(), 0.0) > 0.1 * FULL)]
@@ -140,7 +142,13 @@ def test_rows_of_a_rolling_shutter_see_a_vibration_at_their_own_time(film: FilmS
 
 
 def test_equal_seeds_and_times_give_equal_pictures_and_others_do_not(film: FilmShape) -> None:
-    every = {"brightness": 0.01, "seeing_um": 5.0, "dust": 5, "sticking": 0.02, "ambient_fraction": 0.01}
+    every = {
+        "brightness_fraction": 0.01,
+        "seeing_um": 5.0,
+        "dust": 5,
+        "sticking_fraction": 0.02,
+        "ambient_fraction": 0.01,
+    }
     first, again = ([bench(film, **every).render(crossed(), 0.0, time_s=3.0)] for _ in range(2))
     assert np.array_equal(first, again)
     renderer = bench(film, **every)
@@ -151,7 +159,7 @@ def test_equal_seeds_and_times_give_equal_pictures_and_others_do_not(film: FilmS
 
 def test_simulate_disturbs_a_tracking_set_and_tells_its_vibrations(tmp_path: Path) -> None:
     config = tmp_path / "bench.toml"
-    config.write_text("[twin]\ndrum_nm = 5.0\n[twin.disturbances]\nbrightness = 0.005\ndust = 3\n")
+    config.write_text("[twin]\ndrum_nm = 5.0\n[twin.disturbances]\nbrightness_fraction = 0.005\ndust = 3\n")
     words = ["--config", str(config), "--track", "3", "--shrink", "16", "--noise-adu", "0"]
     assert run(["simulate", str(tmp_path / "set"), *words]) == Exit.DONE
     assert run(["simulate", str(tmp_path / "plain"), *words[2:]]) == Exit.DONE
@@ -163,7 +171,7 @@ def test_simulate_disturbs_a_tracking_set_and_tells_its_vibrations(tmp_path: Pat
     assert "drum_um" not in np.load(tmp_path / "plain" / "track" / "truth.npz")
 
 
-@pytest.mark.parametrize("line", ["brightness = -0.1", "dust = 2.5", "rolling_s = nan", "haze = 1"])
+@pytest.mark.parametrize("line", ["brightness_fraction = -0.1", "dust = 2.5", "rolling_s = nan", "haze = 1"])
 def test_an_impossible_disturbance_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
