@@ -109,12 +109,15 @@ class LiveErrors:
         if np.isfinite(readings_um).all():  # motion is taken out to first order
             film_um += _SECOND_ORDER * float(np.std(readings_um))
         x_to_y_um = consistency.left_by_laser_um(readings_um, _rms(seen.moved_um), laser_noise_um)
+        vertex_um = consistency.vertex_um(readings_um, laser_noise_um)
+        if not np.isfinite(readings_um).all():  # half of that motion is in the frames' mean
+            vertex_um = math.hypot(vertex_um, x_to_y_um / 2)
         effects = [
             light * self.frames.level,
             light * self.frames.swing,
             film_um * self.frames.film,
             x_to_y_um * self.frames.x_to_y[:, None],
-            consistency.vertex_um(readings_um, laser_noise_um) * self.vertex[:, None],
+            vertex_um * self.vertex[:, None],
         ]
         told_um = float(np.subtract(*(part.mean() for part in np.split(seen.told_um, 2))))
         shared_mm2 = moved_um**2 * self.per_um2 + told_um**2 * self.told_um2
