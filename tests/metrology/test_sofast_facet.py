@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.measure import sofast
+from membrane_ctrl.measure import measure as sofast
 from membrane_ctrl.measure.measure import SHIFTS_RAD, lit_pixels, series_of
 from membrane_ctrl.metrology.frames.integrity import closure, closure_with_level, closure_with_phase
 from membrane_ctrl.metrology.frames.series_integrity import check_series, predicted_phase, unwrap
