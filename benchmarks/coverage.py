@@ -93,9 +93,15 @@ class BentRays(OpticsRenderer):
         away = arriving - 2 * np.sum(arriving * normal, axis=1, keepdims=True) * normal / np.sum(
             normal**2, axis=1, keepdims=True
         )
+        found.s_x_mm[seen], found.s_y_mm[seen] = self._behind_glass(p, away, bend).T
+        found.x_mm[seen], found.y_mm[seen] = x, y
+        return found
+
+    def _behind_glass(self, start_mm: FloatArray, away: FloatArray, bend: FloatArray) -> FloatArray:
+        """s_x and s_y (n, 2) of the pixels that rays from `start_mm` (n, 3) show."""
         screen = self._screen_pose
         face = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
-        q, out, down = (p - screen.origin_mm) @ face.T, away @ face.T, face @ bend
+        q, out, down = (start_mm - screen.origin_mm) @ face.T, away @ face.T, face @ bend
         path = -q[:, 2] / out[:, 2]
         for _ in range(6):
             on = q + path[:, None] * out + path[:, None] ** 2 / 2 * down
@@ -103,10 +109,16 @@ class BentRays(OpticsRenderer):
             path = path + (off_mm - on[:, 2]) / out[:, 2]
         on = q + path[:, None] * out + path[:, None] ** 2 / 2 * down
         across = out[:, :2] / np.linalg.norm(out, axis=1, keepdims=True) / GLASS_INDEX  # Snell
-        behind = on[:, :2] + self.glass_mm * across / np.sqrt(1 - np.sum(across**2, axis=1, keepdims=True))
-        for name, value in (("x_mm", x), ("y_mm", y), ("s_x_mm", behind[:, 0]), ("s_y_mm", behind[:, 1])):
-            getattr(found, name)[seen] = value
-        return found
+        return np.asarray(on[:, :2] + self.glass_mm * across / np.sqrt(1 - np.sum(across**2, axis=1, keepdims=True)))
+
+
+class DirectRays(BentRays):
+    """The screen itself before the camera, behind its glass."""
+
+    def _trace(self, directions: FloatArray, displacement_um: float, film: Any = None) -> Trace:
+        bend, none = np.array([0.0, -AIR_PER_MM * self.air_k_per_m, 0.0]), np.zeros(len(directions))
+        start_mm = np.tile(self._camera_pose.position_mm, (len(directions), 1))
+        return Trace(none, none, *self._behind_glass(start_mm, directions, bend).T)
 
 
 def stated_bench(calibrated: bool) -> OpticsConfig:
@@ -167,6 +179,7 @@ class Room:
     moves_um: float
     dust: bool
     stale: bool
+    held: bool = False  # the film comes to the same place in each set
     mean_um: float = 0.0  # of the film in the last set
 
     @classmethod
@@ -200,6 +213,8 @@ class Room:
         shown = pattern_sequence("full", OpticsConfig().pattern)
         where_um = self.moves_um * np.cumsum(rng.standard_normal(len(shown))) / math.sqrt(len(shown))
         where_um += rng.uniform(-20.0, 20.0) * (self.moves_um > 0)
+        if self.held:
+            where_um -= where_um.mean()
         white = render(shown[-2], 0.0, 1.0)
         frames = []
         for k, (pattern, place_um) in enumerate(zip(shown, where_um, strict=True)):

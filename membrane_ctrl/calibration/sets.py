@@ -99,7 +99,19 @@ class Bundle:
     optics: OpticsConfig
     reference_um: float
     notes: tuple[str, ...] = ()
+    apart: str = ""  # why the sets may be of different benches, though each states the same
     edges_px: tuple[FloatArray, ...] = ()  # of the rim, in the sets that show it
+
+
+def _judged(findings: Sequence[verdict.CalibrationFinding], bundle: Bundle) -> tuple[verdict.CalibrationFinding, ...]:
+    """The findings with the notes; a refusal of sets that may be of different benches says so first."""
+    notes = bundle.notes
+    if bundle.apart and any(finding.fatal for finding in findings):
+        doubt = f"{bundle.apart}; if it was not: "
+        findings = [replace(each, says=doubt + each.says) if each.fatal else each for each in findings]
+    elif bundle.apart:
+        notes = (bundle.apart, *notes)
+    return (*findings, *(verdict.CalibrationFinding(False, note) for note in notes))
 
 
 def calibrate_command(options: CalibrateOptions) -> int:
@@ -114,7 +126,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     if not findings:
         try:
             solution = solve(problem, _progress())
-            findings = (*verdict.after(solution), *(verdict.CalibrationFinding(False, note) for note in bundle.notes))
+            findings = _judged(verdict.after(solution), bundle)
         except ValueError as error:
             findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
@@ -197,13 +209,14 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
         first = next((k for k, phases in enumerate(sets) if phases.artefact is None), 0)
         _same_rig(used[first], benches[first], folder, bench, sets[first].artefact is head.artefact)
     for each in elsewhere:
-        _join(sets, *each)
+        join(sets, *each)
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     if not films:
         raise errors.InputError(f"{folders[0]}: {_NO_FILM}")
     named = sorted({benches[k].geometry.reference_displacement_um or 0.0 for k in films})
+    apart = ""
     if reference_um is None and len(named) > 1:
-        notes.append(
+        apart = (
             f"the sets state reference_displacement_um from {named[0]:.0f} to {named[-1]:.0f} um; the first set's is "
             "used: if the geometry was measured anew for each set, they are not of one bench"
         )
@@ -213,7 +226,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
         sets[films[0]] = replace(sets[films[0]], displacement_um=reference_um)
     if not edges:
         notes.append("the rim is not seen in any full set: its size is not used")
-    return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), tuple(edges))
+    return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
 
 
 def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
@@ -238,7 +251,7 @@ def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
     return residuals.SetPhases(name, *place, sigma_mm, math.nan, artefact=screen, elsewhere=where)
 
 
-def _join(
+def join(
     sets: list[residuals.SetPhases], folder: Path, phases: residuals.SetPhases, moved: file.ScreenMovedTable
 ) -> None:
     """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if there is none."""

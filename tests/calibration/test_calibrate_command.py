@@ -7,6 +7,7 @@ import json
 import shutil
 import tomllib
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ import numpy as np
 import pytest
 import tomli_w
 
+from membrane_ctrl.calibration import sets
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
 from membrane_ctrl.geometry.file import screen_elsewhere
+from membrane_ctrl.metrology.calibrate.verdict import CalibrationFinding
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
@@ -209,6 +212,20 @@ def test_the_report_notes_sets_that_state_different_references(
     run(["calibrate", str(folders[2]), str(folders[0]), "--out", str(tmp_path / "geometry.toml")])
     said = capsys.readouterr()
     assert "the sets state" not in said.out + said.err
+
+
+def test_a_refusal_of_sets_with_different_references_names_these_first() -> None:
+    crept, wide = CalibrationFinding(True, "camera or screen crept", (1,)), CalibrationFinding(False, "wide")
+    bundle = sets.Bundle((), OpticsConfig(), 0.0, ("no rim",), "the sets state two references")
+    found = sets._judged([crept, wide], bundle)
+    assert [(each.fatal, each.says) for each in found] == [
+        (True, "the sets state two references; if it was not: camera or screen crept"),
+        (False, "wide"),
+        (False, "no rim"),
+    ]
+    assert found[0].sets == (1,)
+    one = sets._judged([crept], replace(bundle, apart=""))
+    assert [each.says for each in one] == ["camera or screen crept", "no rim"]
 
 
 def test_a_set_given_twice_is_refused(folders: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
