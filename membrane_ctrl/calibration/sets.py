@@ -58,6 +58,7 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
         motion_um=float(x_um.mean() - y_um.mean()),
         motion_sigma_um=film.x_to_y_sigma_um if math.isfinite(film.x_to_y_sigma_um) else _MOTION_UNSEEN_UM,
         moved_um=film.moved_um,
+        period_mm=optics.pattern.period_mm,
     )
 
 
@@ -248,7 +249,8 @@ def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
     swing = view.swing_adu.reshape(2, -1)[:, index]
     sigma_mm = phase.mm_per_rad(pattern) * np.hypot(*(np.array(shares)[:, None] / swing)) / math.sqrt(2)
     name, where = head.folder.name, (residuals.ANYWHERE,)
-    return residuals.SetPhases(name, *place, sigma_mm, math.nan, artefact=screen, elsewhere=where)
+    known: dict[str, Any] = {"artefact": screen, "elsewhere": where, "period_mm": pattern.period_mm}
+    return residuals.SetPhases(name, *place, sigma_mm, math.nan, **known)
 
 
 def join(

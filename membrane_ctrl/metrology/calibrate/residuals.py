@@ -95,6 +95,7 @@ class SetPhases:
     artefact: Artefact | SeenScreen | None = None  # what is seen instead of the film
     elsewhere: tuple[Elsewhere, ...] = ()
     screen: IntArray | None = None  # (n,): with which of them a point was seen, from 1; 0, or None, in its place
+    period_mm: float = 0.0  # of the fringes; 0: unknown, and nothing that repeats with them is taken out
 
     def seen_with(self, screen: int) -> BoolArray:
         """Which points (n,) were seen with the screen in that place."""

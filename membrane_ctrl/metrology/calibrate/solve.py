@@ -144,7 +144,8 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
         start = _solve(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
-        pairs = zip(problem.sets, start.states, strict=True)
+        clean = separable.without_waves(start.bench, problem.sets, start.states)
+        pairs = zip(clean, start.states, strict=True)
         problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
     states = start.states if start is not None else first_states(problem)
     # the parameters as stated, and the ring as the first surfaces have it
