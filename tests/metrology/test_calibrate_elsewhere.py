@@ -193,7 +193,9 @@ def test_a_screen_seen_through_another_lens_is_named() -> None:
     known = seen_directly(values, (0.0, 25.0), 5), seen_directly(values, (25.0, 0.0), 6)
     wrong = seen_directly(other, (-20.0, 10.0), 7, "later")
     says = [each.says for each in after(solve(replace(problem, sets=(*known, *problem.sets, wrong)))) if each.fatal]
-    assert says == ["later disagrees with all the others: it shows another lens, or another screen"]
+    assert says == [
+        "later disagrees with all the others: it shows another lens, another screen, or it was out of focus"
+    ]
 
 
 def test_what_is_no_plane_with_fringes_is_refused() -> None:

@@ -13,7 +13,9 @@ from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
+from membrane_ctrl.metrology.calibrate.separable import without_waves
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
+from membrane_ctrl.metrology.calibrate.verdict import after
 
 SIGMAS = sigmas()
 SEEDS = range(12)
@@ -95,6 +97,43 @@ def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
     claimed = solved(5)[1].sigmas
     assert np.allclose(few.sigmas[SIGMAS > 0], claimed[SIGMAS > 0], rtol=0.15)
     assert np.all(np.abs(few.values - values)[SIGMAS > 0] < 4 * few.sigmas[SIGMAS > 0])
+
+
+def with_waves(truth: Truth, amplitude_mm: float, period_mm: float = 49.82) -> Truth:
+    """The fourth set's frames had light that differed: its phases err once and twice per fringe."""
+    sets = [replace(phases, period_mm=period_mm) for phases in truth.sets]
+    turns = 2 * np.pi * sets[3].screen_mm / 49.82
+    waves_mm = amplitude_mm * (np.cos(turns + 1.0) + 0.4 * np.sin(2 * turns))
+    sets[3] = replace(sets[3], screen_mm=sets[3].screen_mm + waves_mm)
+    return replace(truth, sets=tuple(sets))
+
+
+def test_a_set_whose_light_differed_between_its_frames_is_not_of_another_bench() -> None:
+    """It counted as one: the first such sets of random benches were refused by that name."""
+    truth = make(drawn(9), seed=9, points=30_000)
+    spoilt = with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()))
+    solution = solve(spoilt.problem(sigmas()))
+    assert not [finding.says for finding in after(solution) if finding.fatal]
+    clean = np.sqrt([each.variance for each in solution.equations])
+    assert clean[3] < 2.5 * np.median(clean)  # second order is left
+    unknown = solve(with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()), 0.0).problem(sigmas()))
+    left = np.sqrt([each.variance for each in unknown.equations])
+    assert left[3] > 3 * np.median(left)
+
+
+def test_waves_that_all_sets_have_and_what_is_no_wave_stay() -> None:
+    truth, solution = solved(2)
+    sigma_mm = float(truth.sets[3].sigma_mm.mean())
+    sets = [replace(phases, period_mm=49.82) for phases in truth.sets]
+    turns = [2 * np.pi * phases.screen_mm / 49.82 for phases in sets]
+    alike = [replace(p, screen_mm=p.screen_mm + 3 * sigma_mm * np.cos(t)) for p, t in zip(sets, turns, strict=True)]
+    for some in (sets, alike):
+        kept = without_waves(solution.bench, some, solution.states)
+        assert all(a.screen_mm is b.screen_mm for a, b in zip(kept, some, strict=True))
+    bowl_mm = 1e-5 * sets[3].screen_mm * np.hypot(*sets[3].screen_mm)  # as of another bench: 40 sigma
+    sets[3] = replace(sets[3], screen_mm=sets[3].screen_mm + bowl_mm)
+    kept = without_waves(solution.bench, sets, solution.states)
+    assert np.std(kept[3].screen_mm - truth.sets[3].screen_mm - bowl_mm) < 0.05 * np.std(bowl_mm)
 
 
 def test_outliers_do_not_move_the_solution() -> None:

@@ -120,7 +120,8 @@ def test_a_sphere_that_is_not_as_stated_is_refused_by_its_name() -> None:
     (finding,) = after(with_known(problem, looked_at(values, stated, 1 / 3460.0, 0.0, 4)))
     assert finding.fatal
     assert finding.says == (
-        "known disagrees with all the others: it is not the sphere that its file states, or it stood elsewhere"
+        "known disagrees with all the others: it is not the sphere that its file states, it stood elsewhere, or it "
+        "was out of focus"
     )
 
 

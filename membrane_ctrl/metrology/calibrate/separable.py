@@ -311,7 +311,10 @@ def rim_harmonics() -> FloatArray:
 
 
 _WAVES = range(1, 5)  # per fringe: light that differs between frames makes one and two, gamma in four steps four
-_WAVES_SEEN, _OUTSTANDING = 0.5, 2.0  # of a point's noise, and of the usual set's: smaller ones are part of the scatter
+_WAVES_SEEN, _OUTSTANDING = (
+    0.5,
+    2.0,
+)  # of a point's noise, and of the usual set's: smaller ones are part of the scatter
 
 
 def without_waves(
@@ -319,8 +322,8 @@ def without_waves(
 ) -> tuple[residuals.SetPhases, ...]:
     """The sets, those with outstanding errors that repeat with the fringes without these.
 
-    Light that differs between frames makes them: the errors of a phase then depend on the phase alone, and are seen in
-    the residuals, beside what is smooth there. Such a set would count as one of another bench.
+    Light that differs between frames makes them: the errors of a phase then depend on the phase alone, and show in the
+    residuals, beside what is smooth there. Such a set would count as one of another bench.
     """
     waves = [_waves_mm(bench, *pair) for pair in zip(sets, states, strict=True)]
     sizes = np.array([np.std(of_set) / np.mean(each.sigma_mm) for of_set, each in zip(waves, sets, strict=True)])

@@ -188,7 +188,7 @@ class Artefact:
     @property
     def doubt(self) -> str:
         """What is wrong if it disagrees with the other sets."""
-        return f"it is not the {self.name} that its file states, or it stood elsewhere"
+        return f"it is not the {self.name} that its file states, it stood elsewhere, or it was out of focus"
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
         """Parameters (36,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
@@ -220,7 +220,7 @@ class SeenScreen:
     origin_mm: FloatArray  # (3,): O' in the camera's frame, about
     axes: FloatArray  # (3, 3): rows s_x, s_y and normal there
     name = "screen"
-    doubt = "it shows another lens, or another screen"
+    doubt = "it shows another lens, another screen, or it was out of focus"
 
 
 # The radial profile against Hencky's bowl, and the pressure that belongs to it.
