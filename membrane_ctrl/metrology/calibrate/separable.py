@@ -322,7 +322,7 @@ def without_waves(
 ) -> tuple[residuals.SetPhases, ...]:
     """The sets, those with outstanding errors that repeat with the fringes without these.
 
-    Light that differs between frames makes them: the errors of a phase then depend on the phase alone, and show in the
+    Light that differs between frames makes them: errors of a phase that depend on the phase alone. They show in the
     residuals, beside what is smooth there. Such a set would count as one of another bench.
     """
     waves = [_waves_mm(bench, *pair) for pair in zip(sets, states, strict=True)]
