@@ -62,7 +62,7 @@ def test_light_that_wanders_bends_no_figure_where_the_bins_end(tmp_path: Path) -
     CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(tmp_path / "full")  # type: ignore[arg-type]
     reference = Figures().of(tmp_path / "full")
     scene = scene_of(reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
-    phases, jacobian = scene.phase_rad(scene.surface), scene.jacobian(scene.surface)
+    phases, jacobian = scene.phase_rad(scene.surface), FrameFitter(scene).jacobian
     light = scene.light_adu[0] + np.sum(scene.light_adu[1:] * np.cos(phases), axis=0)
     none, everything = np.zeros(light.size, np.float32), np.full(light.size, 1e6)
     still = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)

@@ -3,7 +3,8 @@
 With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
 W Tukey's weights, which fade where the bins end, and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is
 kept from step to step and from frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It
-is made anew where steps shrink too slowly.
+is made anew where steps shrink too slowly. J of a bin is fringes times what changes slowly over the mirror (derivatives
+of the phases, Noll terms): the latter is the mean of four bins, so that all products take a quarter of the time.
 
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
@@ -13,6 +14,7 @@ A, z_x, z_y of a bin; l and b are the maps that the fits found. The angles of z 
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -20,8 +22,8 @@ from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
-from membrane_ctrl.metrology.track.scene import CrossedScene
-from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+from membrane_ctrl.metrology.track.scene import FOUR, CrossedScene
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
 
 TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
 _MAX_STEPS = 10
@@ -35,6 +37,7 @@ _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 # Tukey's weight reaches 0 here: noise keeps its weight, dust and glints have none
 _TUKEY_SIGMAS = 7.0
 _UNKNOWNS = PARAMETERS + 3 * TERMS
+_STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
 _BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
 _STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
@@ -43,18 +46,22 @@ _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now th
 
 
 @kernel
-def _model(base, turn, shifts, maps, response, edge, seen, reach, out):  # type: ignore[no-untyped-def]
-    """Rows of `out` (7, n): e w r times dI by phi_x, by phi_y, by A, by B_x, by B_y; residual r, Tukey's weight w.
+def _model(base, turn, shifts, light, maps, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
+    """Residual r and Tukey's weight w of n bins in `out` (2, n), and of their fours in `pull` (5, n / 4) sums of e w r
+    times dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y.
 
-    `maps` (3, n) are level and swings, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves a bin out.
+    `light` (3, n) are A, B_x, B_y, `turn` (2, n / 4) and `maps` (3, n / 4) changes of phases and light, `edge` (n,) is
+    e, `reach` (n,) is where w ends; 0 leaves a bin out.
     """
+    pull[:] = 0
     bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
     for p in range(seen.size):
-        x = base[0, p] + turn[0, p] + shifts[0]
-        y = base[1, p] + turn[1, p] + shifts[1]
+        q = p // FOUR
+        x = base[0, p] + turn[0, q] + shifts[0]
+        y = base[1, p] + turn[1, q] + shifts[1]
         cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
-        light = maps[0, p] + maps[1, p] * cx + maps[2, p] * cy
-        steep_x, steep_y, twice = maps[1, p], maps[2, p], 0.0
+        steep_x, steep_y, twice = light[1, p] * maps[1, q], light[2, p] * maps[2, q], 0.0
+        shown = light[0, p] * maps[0, q] + steep_x * cx + steep_y * cy
         if bent:
             v = 0.5 + 0.25 * (cx + cy)
             most = 2 * (steep_x + steep_y)
@@ -63,21 +70,21 @@ def _model(base, turn, shifts, maps, response, edge, seen, reach, out):  # type:
                 slope += response[k] * ((k + 2) * power - 1)
                 power *= v
                 h += response[k] * (power - v)
-            light += most * h
+            shown += most * h
             twice = 2 * h
             steep_x += most * slope / 4
             steep_y += most * slope / 4
-        r = seen[p] - light
+        r = seen[p] - shown
         u = r / reach[p] if reach[p] > 0 else 1.0
         w = (1 - u * u) * (1 - u * u) if u * u < 1 else 0.0
-        pull = w * r * edge[p]
-        out[0, p] = -pull * steep_x * sx
-        out[1, p] = -pull * steep_y * sy
-        out[2, p] = pull
-        out[3, p] = pull * (cx + twice)
-        out[4, p] = pull * (cy + twice)
-        out[5, p] = r
-        out[6, p] = w
+        weighed = w * r * edge[p]
+        pull[0, q] -= weighed * steep_x * sx
+        pull[1, q] -= weighed * steep_y * sy
+        pull[2, q] += weighed * light[0, p]
+        pull[3, q] += weighed * light[1, p] * (cx + twice)
+        pull[4, q] += weighed * light[2, p] * (cy + twice)
+        out[0, p] = r
+        out[1, p] = w
 
 
 @dataclass(frozen=True)
@@ -98,19 +105,21 @@ class FrameFitter:
     ----------
     scene : CrossedScene
         What a frame must show.
-    jacobian : (2, 36, n) array, optional
-        Of another scene with the same bins and surface; made anew if not given.
+    jacobian : (2, 36, n / 4) array, optional
+        That of a fitter of another scene with the same bins and surface; made anew if not given.
     """
 
     def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
         self.scene = scene
-        self.jacobian = scene.jacobian(scene.surface) if jacobian is None else jacobian
+        self.jacobian = _mean(scene.jacobian(scene.surface)) if jacobian is None else jacobian
+        self._basis = _mean(scene.basis)
         self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
-        self._out = np.empty((7, scene.index.size), np.float32)
-        self._maps = np.empty((3, scene.index.size), np.float32)
+        self._out = np.empty((2, scene.index.size), np.float32)
+        self._pull = np.empty((5, scene.index.size // FOUR), np.float32)
+        self._maps = np.empty((3, scene.index.size // FOUR), np.float32)
 
     def fit(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
@@ -143,7 +152,7 @@ class FrameFitter:
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, reach)
             if self._inverse is None:
-                self._inverse = self._inverted(shifts_rad, shape, light, self._out[6])
+                self._inverse = self._inverted(shifts_rad, shape, light, self._out[1])
                 matrices, change = matrices + 1, math.inf  # its first step is not judged by an old one's last
             if self._inverse is None:
                 break
@@ -155,49 +164,42 @@ class FrameFitter:
                 break
             if change > _SLOW * last and (matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)):
                 self._inverse = None
-        residual, weights = self._out[5].copy(), self._out[6].copy()
+        residual, weights = self._out.copy()
         return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM)
 
     def _evaluate(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)  # first: it may trace anew
-        fixed = (self._base, turn, shifts, self._maps, self.scene.response, self.scene.edge)
-        # On one thread: the model takes half a millisecond, and waking a second thread takes as long
-        _model(*fixed, seen_adu, reach, self._out)
+        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)
+        fixed = (self._light_adu, self._maps, self.scene.response, self.scene.edge)
+        _model(self._base, turn, shifts, *fixed, seen_adu, reach, self._pull, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
-        """Phases (2, n) of a surface beyond those of the one that was traced last; the maps follow the light."""
+        """Phases (2, n / 4) of a surface beyond those of the one that was traced last; the maps follow the light."""
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
             self._traced, moved = shape, np.zeros(PARAMETERS)
             self._base = _reduced(self.scene.phase_rad(shape))
-        np.matmul(light.astype(np.float32), self.scene.basis, out=self._maps)
+        np.matmul(light.astype(np.float32), self._basis, out=self._maps)
         self._maps += 1
-        self._maps *= self._light_adu
         return np.asarray(moved.astype(np.float32) @ self.jacobian)
 
     def _right(self) -> FloatArray:
         """J^T W r (144,) of the last evaluation."""
-        of_surface = self.jacobian[0] @ self._out[0] + self.jacobian[1] @ self._out[1]
-        of_light = (self._out[2:5] * self._light_adu) @ self.scene.basis.T
-        return np.concatenate([of_surface, of_light.ravel()]).astype(float)
+        of_surface = self.jacobian[0] @ self._pull[0] + self.jacobian[1] @ self._pull[1]
+        return np.concatenate([of_surface, (self._pull[2:] @ self._basis.T).ravel()]).astype(float)
 
-    def _columns(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
-        """J (144, n)."""
+    def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
+        """Rows (5, n): dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y."""
         turn = self._turned(shape, light)  # may trace anew
-        x, y = self._base + turn + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
-        swing_x, swing_y = self._maps[1], self._maps[2]
+        x, y = self._base + np.repeat(turn, FOUR, axis=1) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         level, first, second = self._light_adu
-        out = np.empty((_UNKNOWNS, self.scene.index.size), np.float32)
+        _, swing_x, swing_y = self._light_adu * np.repeat(self._maps, FOUR, axis=1)
         slope, twice = self._bent(x, y)
         steeper = (swing_x + swing_y) / 2 * slope
-        out[:PARAMETERS] = -(swing_x + steeper) * np.sin(x) * self.jacobian[0]
-        out[:PARAMETERS] -= (swing_y + steeper) * np.sin(y) * self.jacobian[1]
-        for k, wave in enumerate((level, first * (np.cos(x) + twice), second * (np.cos(y) + twice))):
-            out[PARAMETERS + k * TERMS : PARAMETERS + (k + 1) * TERMS] = self.scene.basis * wave
-        return out
+        of_phases = -(swing_x + steeper) * np.sin(x), -(swing_y + steeper) * np.sin(y)
+        return np.stack([*of_phases, level, first * (np.cos(x) + twice), second * (np.cos(y) + twice)])
 
     def _bent(self, x: Singles, y: Singles) -> tuple[Singles, Singles]:
         """Slope (n,) of what the panel's response adds to a straight line, and twice its value, as in `_model`."""
@@ -211,8 +213,13 @@ class FrameFitter:
         self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, weights: Singles
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
-        columns = self._columns(shifts_rad, shape, light)
-        matrix = ((columns * (weights * self.scene.edge)) @ columns.T).astype(float)
+        waves = self._waves(shifts_rad, shape, light)
+        slow = [*self.jacobian, *[self._basis] * 3]
+        matrix = np.zeros((_UNKNOWNS, _UNKNOWNS))
+        for i, j in product(range(len(slow)), repeat=2):
+            rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
+            both = _sum(waves[i] * waves[j] * weights * self.scene.edge)
+            matrix[rows, columns] += (slow[i] * both) @ slow[j].T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not kernels.invert(matrix):
@@ -231,21 +238,24 @@ class FrameFitter:
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
-        pull = gain.astype(np.float32) @ self._columns(shifts_rad, fit.surface, fit.light)
-        pull *= self.scene.edge * fit.weights * fit.residual_adu
-        sums = self.in_squares(pull)
+        waves = self._waves(shifts_rad, fit.surface, fit.light)
+        slow = np.stack([*self.jacobian, *[self._basis] * 3]) * _sum(
+            waves * (self.scene.edge * fit.weights * fit.residual_adu)
+        )[:, None]
+        columns = np.concatenate([slow[0] + slow[1], *slow[2:]])
+        sums = self.in_squares(gain.astype(np.float32) @ columns)
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
 
     def in_squares(self, pull: Singles) -> FloatArray:
-        """Sums (rows, squares) of (rows, n) over squares of the mirror whose errors count as independent.
+        """Sums (rows, squares) of (rows, n / 4) over squares of the mirror whose errors count as independent.
 
         Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
         are as large as those of squares that do not overlap.
         """
-        place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        place = (_mean(self.scene.position_mm) / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
         low = np.floor(place).astype(int)
         upper = np.sin(np.pi / 2 * (place - low)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
@@ -261,6 +271,15 @@ class FrameFitter:
         return np.stack(
             [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
         )
+
+
+def _sum(values: AnyArray) -> AnyArray:
+    """Of the fours (..., n / 4) of bins (..., n)."""
+    return np.asarray(values.reshape(*values.shape[:-1], -1, FOUR).sum(axis=-1))
+
+
+def _mean(values: AnyArray) -> AnyArray:
+    return np.asarray(values.reshape(*values.shape[:-1], -1, FOUR).mean(axis=-1))
 
 
 def _reduced(phase_rad: FloatArray) -> Singles:
@@ -331,10 +350,12 @@ def stepped(
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
-    weighted = fitter.jacobian * weight[:, None].astype(np.float32) ** 2
+    weight = weight**2
+    weighted = fitter.jacobian * _sum(weight)[:, None]
     matrix: FloatArray = np.sum(weighted @ fitter.jacobian.transpose(0, 2, 1), axis=0, dtype=float)
-    moved = np.asarray(np.linalg.solve(matrix, np.einsum("apn,an->p", weighted, off_rad)), float)
-    left_rad = off_rad - moved @ fitter.jacobian
-    pull = np.sum(weighted * left_rad[:, None].astype(np.float32), axis=0)  # light that changed between the steps
+    right = np.einsum("apn,an->p", fitter.jacobian, _sum(weight * off_rad), dtype=float)
+    moved = np.asarray(np.linalg.solve(matrix, right), float)
+    left_rad = off_rad - np.repeat(moved @ fitter.jacobian, FOUR, axis=1)
+    pull = np.sum(fitter.jacobian * _sum(weight * left_rad)[:, None], axis=0)  # light that changed between the steps
     errors = np.linalg.solve(matrix, fitter.in_squares(pull))
     return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad
