@@ -22,7 +22,7 @@ from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
-from membrane_ctrl.metrology.track.scene import FOUR, CrossedScene
+from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
 
 TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
@@ -46,17 +46,17 @@ _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now th
 
 
 @kernel
-def _model(base, turn, shifts, light, maps, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
+def _model(base, turn, shifts, light, maps, four, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
     """Residual r and Tukey's weight w of n bins in `out` (2, n), and of their fours in `pull` (5, n / 4) sums of e w r
     times dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y.
 
-    `light` (3, n) are A, B_x, B_y, `turn` (2, n / 4) and `maps` (3, n / 4) changes of phases and light, `edge` (n,) is
-    e, `reach` (n,) is where w ends; 0 leaves a bin out.
+    `light` (3, n) are A, B_x, B_y, `turn` (2, n / 4) and `maps` (3, n / 4) changes of phases and light, `four` (n,) is
+    the four of a bin, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves a bin out.
     """
     pull[:] = 0
     bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
     for p in range(seen.size):
-        q = p // FOUR
+        q = four[p]
         x = base[0, p] + turn[0, q] + shifts[0]
         y = base[1, p] + turn[1, q] + shifts[1]
         cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
@@ -111,15 +111,16 @@ class FrameFitter:
 
     def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
         self.scene = scene
-        self.jacobian = _mean(scene.jacobian(scene.surface)) if jacobian is None else jacobian
-        self._basis = _mean(scene.basis)
+        self._starts = np.flatnonzero(np.diff(scene.four, prepend=-1))  # of the fours
+        self.jacobian = self._mean(scene.jacobian(scene.surface)) if jacobian is None else jacobian
+        self._basis = self._mean(scene.basis)
         self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((2, scene.index.size), np.float32)
-        self._pull = np.empty((5, scene.index.size // FOUR), np.float32)
-        self._maps = np.empty((3, scene.index.size // FOUR), np.float32)
+        self._pull = np.empty((5, self._starts.size), np.float32)
+        self._maps = np.empty((3, self._starts.size), np.float32)
 
     def fit(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
@@ -172,7 +173,7 @@ class FrameFitter:
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
         turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)
-        fixed = (self._light_adu, self._maps, self.scene.response, self.scene.edge)
+        fixed = (self._light_adu, self._maps, self.scene.four, self.scene.response, self.scene.edge)
         _model(self._base, turn, shifts, *fixed, seen_adu, reach, self._pull, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
@@ -193,9 +194,9 @@ class FrameFitter:
     def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
         """Rows (5, n): dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y."""
         turn = self._turned(shape, light)  # may trace anew
-        x, y = self._base + np.repeat(turn, FOUR, axis=1) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
+        x, y = self._base + turn[:, self.scene.four] + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         level, first, second = self._light_adu
-        _, swing_x, swing_y = self._light_adu * np.repeat(self._maps, FOUR, axis=1)
+        _, swing_x, swing_y = self._light_adu * self._maps[:, self.scene.four]
         slope, twice = self._bent(x, y)
         steeper = (swing_x + swing_y) / 2 * slope
         of_phases = -(swing_x + steeper) * np.sin(x), -(swing_y + steeper) * np.sin(y)
@@ -218,7 +219,7 @@ class FrameFitter:
         matrix = np.zeros((_UNKNOWNS, _UNKNOWNS))
         for i, j in product(range(len(slow)), repeat=2):
             rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
-            both = _sum(waves[i] * waves[j] * weights * self.scene.edge)
+            both = self.sums(waves[i] * waves[j] * weights * self.scene.edge)
             matrix[rows, columns] += (slow[i] * both) @ slow[j].T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
@@ -239,7 +240,7 @@ class FrameFitter:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
         waves = self._waves(shifts_rad, fit.surface, fit.light)
-        slow = np.stack([*self.jacobian, *[self._basis] * 3]) * _sum(
+        slow = np.stack([*self.jacobian, *[self._basis] * 3]) * self.sums(
             waves * (self.scene.edge * fit.weights * fit.residual_adu)
         )[:, None]
         columns = np.concatenate([slow[0] + slow[1], *slow[2:]])
@@ -249,13 +250,20 @@ class FrameFitter:
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
 
+    def sums(self, values: AnyArray) -> AnyArray:
+        """Of the fours (..., n / 4) of bins (..., n)."""
+        return np.asarray(np.add.reduceat(values, self._starts, axis=-1))
+
+    def _mean(self, values: AnyArray) -> AnyArray:
+        return np.asarray(self.sums(values) / np.bincount(self.scene.four).astype(np.float32))
+
     def in_squares(self, pull: Singles) -> FloatArray:
         """Sums (rows, squares) of (rows, n / 4) over squares of the mirror whose errors count as independent.
 
         Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
         are as large as those of squares that do not overlap.
         """
-        place = (_mean(self.scene.position_mm) / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        place = (self._mean(self.scene.position_mm) / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
         low = np.floor(place).astype(int)
         upper = np.sin(np.pi / 2 * (place - low)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
@@ -271,15 +279,6 @@ class FrameFitter:
         return np.stack(
             [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
         )
-
-
-def _sum(values: AnyArray) -> AnyArray:
-    """Of the fours (..., n / 4) of bins (..., n)."""
-    return np.asarray(values.reshape(*values.shape[:-1], -1, FOUR).sum(axis=-1))
-
-
-def _mean(values: AnyArray) -> AnyArray:
-    return np.asarray(values.reshape(*values.shape[:-1], -1, FOUR).mean(axis=-1))
 
 
 def _reduced(phase_rad: FloatArray) -> Singles:
@@ -351,11 +350,11 @@ def stepped(
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
     weight = weight**2
-    weighted = fitter.jacobian * _sum(weight)[:, None]
+    weighted = fitter.jacobian * fitter.sums(weight)[:, None]
     matrix: FloatArray = np.sum(weighted @ fitter.jacobian.transpose(0, 2, 1), axis=0, dtype=float)
-    right = np.einsum("apn,an->p", fitter.jacobian, _sum(weight * off_rad), dtype=float)
+    right = np.einsum("apn,an->p", fitter.jacobian, fitter.sums(weight * off_rad), dtype=float)
     moved = np.asarray(np.linalg.solve(matrix, right), float)
-    left_rad = off_rad - np.repeat(moved @ fitter.jacobian, FOUR, axis=1)
-    pull = np.sum(fitter.jacobian * _sum(weight * left_rad)[:, None], axis=0)  # light that changed between the steps
+    left_rad = off_rad - (moved @ fitter.jacobian)[:, fitter.scene.four]
+    pull = np.sum(fitter.jacobian * fitter.sums(weight * left_rad)[:, None], axis=0)  # light that changed between the steps
     errors = np.linalg.solve(matrix, fitter.in_squares(pull))
     return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

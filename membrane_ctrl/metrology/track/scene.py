@@ -16,13 +16,12 @@ from membrane_ctrl.metrology import bins, full, phase, reconstruct
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
-FOUR = 4  # bins, two by two, follow one another
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
@@ -39,12 +38,13 @@ _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 @dataclass(frozen=True)
 class CrossedScene:
-    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, in fours of two by two."""
+    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, square by square of two by two."""
 
     tracer: reconstruct.Tracer  # the bench with the vertex of the reference
     surface: Surface  # of the reference
     bin_px: int
-    index: IntArray  # (n,): bins, counted row by row; neighbours two by two
+    index: IntArray  # (n,): bins, counted row by row
+    four: IntArray  # (n,): number of the square of two by two, or of what is known of it; ascending
     points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
@@ -117,7 +117,8 @@ def scene_of(
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
-    index, known = _in_fours(np.isfinite(coarse).all(axis=0).reshape(rows, columns))
+    known = np.isfinite(coarse).all(axis=0)
+    index, four = _in_fours(np.flatnonzero(known), columns)
     grid = bins.BinGrid(tracer.geometry, camera, bin_px)
     points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
@@ -125,12 +126,13 @@ def scene_of(
     position = tracer.position_mm(points)
     seen_rad = tracer.predict_screen(points, shape) * rad_per_mm
     fringe = 2 * math.pi / _rad_per_bin(index, (rows, columns), seen_rad, _USUAL)
-    inwards = ndimage.distance_transform_edt(np.pad(known, 1))[1:-1, 1:-1].reshape(-1)[index]
+    inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[1:-1, 1:-1].reshape(-1)[index]
     return CrossedScene(
         tracer=tracer,
         surface=shape,
         bin_px=bin_px,
         index=index,
+        four=four,
         points=points,
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
@@ -143,16 +145,11 @@ def scene_of(
     )
 
 
-def _in_fours(known: BoolArray) -> tuple[IntArray, BoolArray]:
-    """The bins (n,) of whole squares of two by two known ones, square by square; and where they are."""
-    rows, columns = (side // 2 for side in known.shape)
-    squares = known[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2).all(axis=(1, 3))
-    row, column = 2 * np.array(np.nonzero(squares))
-    corners = np.add.outer(row * known.shape[1] + column, [0, 1, known.shape[1], known.shape[1] + 1])
-    index = corners.ravel()
-    inside = np.zeros_like(known)
-    inside.reshape(-1)[index] = True
-    return index, inside
+def _in_fours(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
+    """Bins (n,) in the order of their squares of two by two, and the number of each one's square."""
+    square = index // columns // 2 * columns + index % columns // 2
+    order = np.argsort(square, kind="stable")
+    return index[order], np.unique(square[order], return_inverse=True)[1]
 
 
 def _pictures(
