@@ -4,7 +4,7 @@ With J the derivatives of the bins' light by 36 parameters of the surface and 3 
 W Tukey's weights, which fade where the bins end, and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is
 kept from step to step and from frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It
 is made anew where steps shrink too slowly. J of a bin is fringes times what changes slowly over the mirror (derivatives
-of the phases, Noll terms): the latter is the mean of four bins, so that all products take a quarter of the time.
+of the phases, Noll terms): the latter is a plane over a cell of bins, so that all products take a fifth of the time.
 
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
@@ -46,43 +46,51 @@ _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now th
 
 
 @kernel
-def _model(base, turn, shifts, light, maps, four, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
-    """Residual r and Tukey's weight w of n bins in `out` (2, n), and of their fours in `pull` (5, n / 4) sums of e w r
-    times dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y.
+def _model(base, turn, shifts, light, maps, cell, offset, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
+    """Residual r and Tukey's weight w of n bins in `out` (2, n), and of their N cells in `pull` (5, 3, N) moments of
+    e w r times dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y.
 
-    `light` (3, n) are A, B_x, B_y, `turn` (2, n / 4) and `maps` (3, n / 4) changes of phases and light, `four` (n,) is
-    the four of a bin, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves a bin out.
+    `light` (3, n) are A, B_x, B_y, `turn` (2, 3, N) and `maps` (3, 3, N) the planes of changes of phases and light,
+    `cell` (n,) and `offset` (2, n) the place of a bin, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves out.
     """
     pull[:] = 0
     bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
     for p in range(seen.size):
-        q = four[p]
-        x = base[0, p] + turn[0, q] + shifts[0]
-        y = base[1, p] + turn[1, q] + shifts[1]
+        q, u, v = cell[p], offset[0, p], offset[1, p]
+        x = base[0, p] + turn[0, 0, q] + turn[0, 1, q] * u + turn[0, 2, q] * v + shifts[0]
+        y = base[1, p] + turn[1, 0, q] + turn[1, 1, q] * u + turn[1, 2, q] * v + shifts[1]
+        level = light[0, p] * (maps[0, 0, q] + maps[0, 1, q] * u + maps[0, 2, q] * v)
+        steep_x = light[1, p] * (maps[1, 0, q] + maps[1, 1, q] * u + maps[1, 2, q] * v)
+        steep_y = light[2, p] * (maps[2, 0, q] + maps[2, 1, q] * u + maps[2, 2, q] * v)
         cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
-        steep_x, steep_y, twice = light[1, p] * maps[1, q], light[2, p] * maps[2, q], 0.0
-        shown = light[0, p] * maps[0, q] + steep_x * cx + steep_y * cy
+        twice, shown = 0.0, level + steep_x * cx + steep_y * cy
         if bent:
-            v = 0.5 + 0.25 * (cx + cy)
+            shade = 0.5 + 0.25 * (cx + cy)
             most = 2 * (steep_x + steep_y)
-            power, slope, h = v, 0.0, 0.0
+            power, slope, h = shade, 0.0, 0.0
             for k in range(4):
                 slope += response[k] * ((k + 2) * power - 1)
-                power *= v
-                h += response[k] * (power - v)
+                power *= shade
+                h += response[k] * (power - shade)
             shown += most * h
             twice = 2 * h
             steep_x += most * slope / 4
             steep_y += most * slope / 4
         r = seen[p] - shown
-        u = r / reach[p] if reach[p] > 0 else 1.0
-        w = (1 - u * u) * (1 - u * u) if u * u < 1 else 0.0
+        far = r / reach[p] if reach[p] > 0 else 1.0
+        w = (1 - far * far) * (1 - far * far) if far * far < 1 else 0.0
         weighed = w * r * edge[p]
-        pull[0, q] -= weighed * steep_x * sx
-        pull[1, q] -= weighed * steep_y * sy
-        pull[2, q] += weighed * light[0, p]
-        pull[3, q] += weighed * light[1, p] * (cx + twice)
-        pull[4, q] += weighed * light[2, p] * (cy + twice)
+        pulls = (
+            -weighed * steep_x * sx,
+            -weighed * steep_y * sy,
+            weighed * light[0, p],
+            weighed * light[1, p] * (cx + twice),
+            weighed * light[2, p] * (cy + twice),
+        )
+        for k in range(5):
+            pull[k, 0, q] += pulls[k]
+            pull[k, 1, q] += pulls[k] * u
+            pull[k, 2, q] += pulls[k] * v
         out[0, p] = r
         out[1, p] = w
 
@@ -105,22 +113,22 @@ class FrameFitter:
     ----------
     scene : CrossedScene
         What a frame must show.
-    jacobian : (2, 36, n / 4) array, optional
+    jacobian : (2, 36, 3, N) array, optional
         That of a fitter of another scene with the same bins and surface; made anew if not given.
     """
 
     def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
         self.scene = scene
-        self._starts = np.flatnonzero(np.diff(scene.four, prepend=-1))  # of the fours
-        self.jacobian = self._mean(scene.jacobian(scene.surface)) if jacobian is None else jacobian
-        self._basis = self._mean(scene.basis)
+        self._starts = np.flatnonzero(np.diff(scene.cell, prepend=-1))
+        self.jacobian = self._planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
+        self._basis = self._planes(scene.basis)
         self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((2, scene.index.size), np.float32)
-        self._pull = np.empty((5, self._starts.size), np.float32)
-        self._maps = np.empty((3, self._starts.size), np.float32)
+        self._pull = np.empty((5, 3, self._starts.size), np.float32)
+        self._maps = np.empty_like(self._pull[:3])
 
     def fit(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
@@ -173,30 +181,32 @@ class FrameFitter:
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
         turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)
-        fixed = (self._light_adu, self._maps, self.scene.four, self.scene.response, self.scene.edge)
+        scene = self.scene
+        fixed = (self._light_adu, self._maps, scene.cell, scene.offset, scene.response, scene.edge)
         _model(self._base, turn, shifts, *fixed, seen_adu, reach, self._pull, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
-        """Phases (2, n / 4) of a surface beyond those of the one that was traced last; the maps follow the light."""
+        """Planes (2, 3, N) of the phases of a surface beyond those of the one that was traced last; the maps follow the light."""
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
             self._traced, moved = shape, np.zeros(PARAMETERS)
             self._base = _reduced(self.scene.phase_rad(shape))
-        np.matmul(light.astype(np.float32), self._basis, out=self._maps)
-        self._maps += 1
-        return np.asarray(moved.astype(np.float32) @ self.jacobian)
+        self._maps[:] = np.tensordot(light.astype(np.float32), self._basis, 1)
+        self._maps[:, 0] += 1
+        return np.asarray(moved.astype(np.float32) @ _flat(self.jacobian)).reshape(2, 3, -1)
 
     def _right(self) -> FloatArray:
         """J^T W r (144,) of the last evaluation."""
-        of_surface = self.jacobian[0] @ self._pull[0] + self.jacobian[1] @ self._pull[1]
-        return np.concatenate([of_surface, (self._pull[2:] @ self._basis.T).ravel()]).astype(float)
+        pull = _flat(self._pull)
+        of_surface = sum(_flat(slow) @ one for slow, one in zip(self.jacobian, pull[:2], strict=True))
+        return np.concatenate([of_surface, (pull[2:] @ _flat(self._basis).T).ravel()]).astype(float)
 
     def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
         """Rows (5, n): dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y."""
         turn = self._turned(shape, light)  # may trace anew
-        x, y = self._base + turn[:, self.scene.four] + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
+        x, y = self._base + self.spread(turn) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         level, first, second = self._light_adu
-        _, swing_x, swing_y = self._light_adu * self._maps[:, self.scene.four]
+        _, swing_x, swing_y = self._light_adu * self.spread(self._maps)
         slope, twice = self._bent(x, y)
         steeper = (swing_x + swing_y) / 2 * slope
         of_phases = -(swing_x + steeper) * np.sin(x), -(swing_y + steeper) * np.sin(y)
@@ -215,7 +225,7 @@ class FrameFitter:
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
         waves = self._waves(shifts_rad, shape, light)
-        slow = [*self.jacobian, *[self._basis] * 3]
+        slow = [planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)]  # it need not be exact
         matrix = np.zeros((_UNKNOWNS, _UNKNOWNS))
         for i, j in product(range(len(slow)), repeat=2):
             rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
@@ -240,9 +250,8 @@ class FrameFitter:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
         waves = self._waves(shifts_rad, fit.surface, fit.light)
-        slow = np.stack([*self.jacobian, *[self._basis] * 3]) * self.sums(
-            waves * (self.scene.edge * fit.weights * fit.residual_adu)
-        )[:, None]
+        pulls = self.moments(waves * (self.scene.edge * fit.weights * fit.residual_adu))
+        slow = np.einsum("akiq,aiq->akq", np.stack([*self.jacobian, *[self._basis] * 3]), pulls)
         columns = np.concatenate([slow[0] + slow[1], *slow[2:]])
         sums = self.in_squares(gain.astype(np.float32) @ columns)
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
@@ -251,14 +260,30 @@ class FrameFitter:
         return np.asarray(seen * np.outer(grown, grown))
 
     def sums(self, values: AnyArray) -> AnyArray:
-        """Of the fours (..., n / 4) of bins (..., n)."""
+        """Of the cells (..., N) of bins (..., n)."""
         return np.asarray(np.add.reduceat(values, self._starts, axis=-1))
 
+    def moments(self, values: AnyArray) -> AnyArray:
+        """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
+        return np.stack([self.sums(values), *(self.sums(values * one) for one in self.scene.offset)], axis=-2)
+
+    def spread(self, planes: AnyArray) -> AnyArray:
+        """Values (..., n) of the bins of planes (..., 3, N) of the cells."""
+        (u, v), cell = self.scene.offset, self.scene.cell
+        return np.asarray(planes[..., 0, cell] + planes[..., 1, cell] * u + planes[..., 2, cell] * v)
+
+    def _planes(self, values: AnyArray) -> Singles:
+        """The planes (..., 3, N) that fit bins (..., n) best."""
+        weights = self.moments(np.stack([np.ones_like(self.scene.offset[0]), *self.scene.offset]))
+        weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
+        inverse = np.linalg.inv(weights.transpose(2, 0, 1))
+        return np.asarray(np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32)
+
     def _mean(self, values: AnyArray) -> AnyArray:
-        return np.asarray(self.sums(values) / np.bincount(self.scene.four).astype(np.float32))
+        return np.asarray(self.sums(values) / np.bincount(self.scene.cell).astype(np.float32))
 
     def in_squares(self, pull: Singles) -> FloatArray:
-        """Sums (rows, squares) of (rows, n / 4) over squares of the mirror whose errors count as independent.
+        """Sums (rows, squares) of (rows, N) over squares of the mirror whose errors count as independent.
 
         Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
         are as large as those of squares that do not overlap.
@@ -275,10 +300,13 @@ class FrameFitter:
 
     def period_um(self) -> FloatArray:
         """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
-        matrix: FloatArray = np.asarray([j.astype(float) @ j.T for j in self.jacobian]).sum(axis=0)
-        return np.stack(
-            [1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1, dtype=float)) for j in self.jacobian]
-        )
+        means = self.jacobian[:, :, 0].astype(float)
+        matrix = sum(j @ j.T for j in means)
+        return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
+
+
+def _flat(planes: AnyArray) -> AnyArray:
+    return planes.reshape(*planes.shape[:-2], -1)
 
 
 def _reduced(phase_rad: FloatArray) -> Singles:
@@ -349,12 +377,14 @@ def stepped(
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
-    weight = weight**2
-    weighted = fitter.jacobian * fitter.sums(weight)[:, None]
-    matrix: FloatArray = np.sum(weighted @ fitter.jacobian.transpose(0, 2, 1), axis=0, dtype=float)
-    right = np.einsum("apn,an->p", fitter.jacobian, fitter.sums(weight * off_rad), dtype=float)
-    moved = np.asarray(np.linalg.solve(matrix, right), float)
-    left_rad = off_rad - (moved @ fitter.jacobian)[:, fitter.scene.four]
-    pull = np.sum(fitter.jacobian * fitter.sums(weight * left_rad)[:, None], axis=0)  # light that changed between the steps
+    weight, slow = weight**2, fitter.jacobian
+    weighted = slow[:, :, 0] * fitter.sums(weight)[:, None]  # it need not be exact: what is left is solved again
+    matrix: FloatArray = np.sum(weighted @ slow[:, :, 0].transpose(0, 2, 1), axis=0, dtype=float)
+    moved, left_rad = np.zeros(PARAMETERS), off_rad
+    for _ in range(2):
+        right = np.einsum("apiq,aiq->p", slow, fitter.moments(weight * left_rad), dtype=float)
+        moved += np.linalg.solve(matrix, right)
+        left_rad = off_rad - fitter.spread(np.tensordot(moved, slow, (0, 1)))
+    pull = np.einsum("apiq,aiq->pq", slow, fitter.moments(weight * left_rad))  # light that changed between the steps
     errors = np.linalg.solve(matrix, fitter.in_squares(pull))
     return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

@@ -22,6 +22,7 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
+_CELL = 4  # bins along the side of a cell, over which what changes slowly is a plane: 1 % of the highest terms at the rim
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
@@ -38,13 +39,14 @@ _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 @dataclass(frozen=True)
 class CrossedScene:
-    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, square by square of two by two."""
+    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, cell by cell."""
 
     tracer: reconstruct.Tracer  # the bench with the vertex of the reference
     surface: Surface  # of the reference
     bin_px: int
     index: IntArray  # (n,): bins, counted row by row
-    four: IntArray  # (n,): number of the square of two by two, or of what is known of it; ascending
+    cell: IntArray  # (n,): number of the square of bins, or of what is known of it; ascending
+    offset: Singles  # (2, n): in bins, from the mean place of the cell's bins
     points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
@@ -118,7 +120,7 @@ def scene_of(
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
     known = np.isfinite(coarse).all(axis=0)
-    index, four = _in_fours(np.flatnonzero(known), columns)
+    index, cell, offset = _in_cells(np.flatnonzero(known), columns)
     grid = bins.BinGrid(tracer.geometry, camera, bin_px)
     points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
@@ -132,7 +134,8 @@ def scene_of(
         surface=shape,
         bin_px=bin_px,
         index=index,
-        four=four,
+        cell=cell,
+        offset=offset,
         points=points,
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
@@ -145,11 +148,14 @@ def scene_of(
     )
 
 
-def _in_fours(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
-    """Bins (n,) in the order of their squares of two by two, and the number of each one's square."""
-    square = index // columns // 2 * columns + index % columns // 2
+def _in_cells(index: IntArray, columns: int) -> tuple[IntArray, IntArray, Singles]:
+    """Bins (n,) in the order of their cells, the number of each one's cell, and its offset (2, n) from the cell's mean."""
+    square = index // columns // _CELL * columns + index % columns // _CELL
     order = np.argsort(square, kind="stable")
-    return index[order], np.unique(square[order], return_inverse=True)[1]
+    index, cell = index[order], np.unique(square[order], return_inverse=True)[1]
+    place = np.stack([index % columns, index // columns])
+    mean = np.stack([np.bincount(cell, row) for row in place]) / np.bincount(cell)
+    return index, cell, (place - mean[:, cell]).astype(np.float32)
 
 
 def _pictures(
