@@ -277,7 +277,7 @@ class FrameFitter:
         weights = self.moments(np.stack([np.ones_like(self.scene.offset[0]), *self.scene.offset]))
         weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
         inverse = np.linalg.inv(weights.transpose(2, 0, 1))
-        return np.asarray(np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32)
+        return np.einsum("qij,...jq->...iq", inverse, self.moments(values)).astype(np.float32, "C")
 
     def _mean(self, values: AnyArray) -> AnyArray:
         return np.asarray(self.sums(values) / np.bincount(self.scene.cell).astype(np.float32))
