@@ -119,15 +119,15 @@ class FrameFitter:
 
     def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
         self.scene = scene
-        self._starts = np.flatnonzero(np.diff(scene.cell, prepend=-1))
-        self.jacobian = self._planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
-        self._basis = self._planes(scene.basis)
+        self._cells = scene.cells
+        self.jacobian = self._cells.planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
+        self._basis = self._cells.planes(scene.basis)
         self._light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((2, scene.index.size), np.float32)
-        self._pull = np.empty((5, 3, self._starts.size), np.float32)
+        self._pull = np.empty((5, *self._basis.shape[1:]), np.float32)
         self._maps = np.empty_like(self._pull[:3])
 
     def fit(
@@ -181,12 +181,11 @@ class FrameFitter:
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface and maps of light."""
         turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)
-        scene = self.scene
-        fixed = (self._light_adu, self._maps, scene.cell, scene.offset, scene.response, scene.edge)
+        fixed = (self._light_adu, self._maps, *self._cells.places, self.scene.response, self.scene.edge)
         _model(self._base, turn, shifts, *fixed, seen_adu, reach, self._pull, self._out)
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
-        """Planes (2, 3, N) of the phases of a surface beyond those of the one that was traced last; the maps follow the light."""
+        """Planes (2, 3, N) of a surface's phases beyond those of the one traced last; the maps follow the light."""
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
             self._traced, moved = shape, np.zeros(PARAMETERS)
@@ -204,9 +203,9 @@ class FrameFitter:
     def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
         """Rows (5, n): dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y."""
         turn = self._turned(shape, light)  # may trace anew
-        x, y = self._base + self.spread(turn) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
+        x, y = self._base + self._cells.spread(turn) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
         level, first, second = self._light_adu
-        _, swing_x, swing_y = self._light_adu * self.spread(self._maps)
+        _, swing_x, swing_y = self._light_adu * self._cells.spread(self._maps)
         slope, twice = self._bent(x, y)
         steeper = (swing_x + swing_y) / 2 * slope
         of_phases = -(swing_x + steeper) * np.sin(x), -(swing_y + steeper) * np.sin(y)
@@ -229,7 +228,7 @@ class FrameFitter:
         matrix = np.zeros((_UNKNOWNS, _UNKNOWNS))
         for i, j in product(range(len(slow)), repeat=2):
             rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
-            both = self.sums(waves[i] * waves[j] * weights * self.scene.edge)
+            both = self._cells.sums(waves[i] * waves[j] * weights * self.scene.edge)
             matrix[rows, columns] += (slow[i] * both) @ slow[j].T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
@@ -250,7 +249,7 @@ class FrameFitter:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS]
         waves = self._waves(shifts_rad, fit.surface, fit.light)
-        pulls = self.moments(waves * (self.scene.edge * fit.weights * fit.residual_adu))
+        pulls = self._cells.moments(waves * (self.scene.edge * fit.weights * fit.residual_adu))
         slow = np.einsum("akiq,aiq->akq", np.stack([*self.jacobian, *[self._basis] * 3]), pulls)
         columns = np.concatenate([slow[0] + slow[1], *slow[2:]])
         sums = self.in_squares(gain.astype(np.float32) @ columns)
@@ -259,36 +258,13 @@ class FrameFitter:
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
 
-    def sums(self, values: AnyArray) -> AnyArray:
-        """Of the cells (..., N) of bins (..., n)."""
-        return np.asarray(np.add.reduceat(values, self._starts, axis=-1))
-
-    def moments(self, values: AnyArray) -> AnyArray:
-        """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
-        return np.stack([self.sums(values), *(self.sums(values * one) for one in self.scene.offset)], axis=-2)
-
-    def spread(self, planes: AnyArray) -> AnyArray:
-        """Values (..., n) of the bins of planes (..., 3, N) of the cells."""
-        (u, v), cell = self.scene.offset, self.scene.cell
-        return np.asarray(planes[..., 0, cell] + planes[..., 1, cell] * u + planes[..., 2, cell] * v)
-
-    def _planes(self, values: AnyArray) -> Singles:
-        """The planes (..., 3, N) that fit bins (..., n) best."""
-        weights = self.moments(np.stack([np.ones_like(self.scene.offset[0]), *self.scene.offset]))
-        weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
-        inverse = np.linalg.inv(weights.transpose(2, 0, 1))
-        return np.einsum("qij,...jq->...iq", inverse, self.moments(values)).astype(np.float32, "C")
-
-    def _mean(self, values: AnyArray) -> AnyArray:
-        return np.asarray(self.sums(values) / np.bincount(self.scene.cell).astype(np.float32))
-
     def in_squares(self, pull: Singles) -> FloatArray:
         """Sums (rows, squares) of (rows, N) over squares of the mirror whose errors count as independent.
 
         Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
         are as large as those of squares that do not overlap.
         """
-        place = (self._mean(self.scene.position_mm) / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        place = (self._cells.planes(self.scene.position_mm)[:, 0] / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
         low = np.floor(place).astype(int)
         upper = np.sin(np.pi / 2 * (place - low)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
@@ -377,14 +353,14 @@ def stepped(
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
-    weight, slow = weight**2, fitter.jacobian
-    weighted = slow[:, :, 0] * fitter.sums(weight)[:, None]  # it need not be exact: what is left is solved again
+    weight, slow, cells = weight**2, fitter.jacobian, fitter.scene.cells
+    weighted = slow[:, :, 0] * cells.sums(weight)[:, None]  # it need not be exact: what is left is solved again
     matrix: FloatArray = np.sum(weighted @ slow[:, :, 0].transpose(0, 2, 1), axis=0, dtype=float)
     moved, left_rad = np.zeros(PARAMETERS), off_rad
     for _ in range(2):
-        right = np.einsum("apiq,aiq->p", slow, fitter.moments(weight * left_rad), dtype=float)
+        right = np.einsum("apiq,aiq->p", slow, cells.moments(weight * left_rad), dtype=float)
         moved += np.linalg.solve(matrix, right)
-        left_rad = off_rad - fitter.spread(np.tensordot(moved, slow, (0, 1)))
-    pull = np.einsum("apiq,aiq->pq", slow, fitter.moments(weight * left_rad))  # light that changed between the steps
+        left_rad = off_rad - cells.spread(np.tensordot(moved, slow, (0, 1)))
+    pull = np.einsum("apiq,aiq->pq", slow, cells.moments(weight * left_rad))  # light that changed between the steps
     errors = np.linalg.solve(matrix, fitter.in_squares(pull))
     return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

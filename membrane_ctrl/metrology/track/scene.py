@@ -16,7 +16,7 @@ from membrane_ctrl.metrology import bins, full, phase, reconstruct
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
 _BIN_RAD = 1.6
@@ -38,6 +38,45 @@ _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
 @dataclass(frozen=True)
+class Cells:
+    """Squares of bins, or what is known of them, over each of which what changes slowly is a plane."""
+
+    places: tuple[IntArray, Singles]  # cell (n,) of each bin, ascending; offset (2, n) from the mean of its cell's bins
+    starts: IntArray  # (N,): first bins
+
+    @staticmethod
+    def of(index: IntArray, columns: int) -> "tuple[IntArray, Cells]":
+        """Bins (n,) in the order of their cells, and these."""
+        square = index // columns // _CELL * columns + index % columns // _CELL
+        order = np.argsort(square, kind="stable")
+        index, (_, starts, cell) = index[order], np.unique(square[order], return_index=True, return_inverse=True)
+        place = np.stack([index % columns, index // columns])
+        mean = np.stack([np.bincount(cell, row) for row in place]) / np.bincount(cell)
+        return index, Cells((cell, (place - mean[:, cell]).astype(np.float32)), starts)
+
+    def sums(self, values: AnyArray) -> AnyArray:
+        """Of the cells (..., N) of bins (..., n)."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
+
+    def moments(self, values: AnyArray) -> AnyArray:
+        """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
+        return np.stack([self.sums(values), *(self.sums(values * one) for one in self.places[1])], axis=-2)
+
+    def spread(self, planes: AnyArray) -> AnyArray:
+        """Values (..., n) of the bins on planes (..., 3, N) of the cells."""
+        cell, (u, v) = self.places
+        return np.asarray(planes[..., 0, cell] + planes[..., 1, cell] * u + planes[..., 2, cell] * v)
+
+    def planes(self, values: AnyArray) -> Singles:
+        """The planes (..., 3, N) that fit values of bins (..., n) best."""
+        offset = self.places[1]
+        weights = self.moments(np.stack([np.ones_like(offset[0]), *offset]))
+        weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
+        inverse = np.linalg.inv(weights.transpose(2, 0, 1))
+        return np.einsum("qij,...jq->...iq", inverse, self.moments(values)).astype(np.float32, "C")
+
+
+@dataclass(frozen=True)
 class CrossedScene:
     """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, cell by cell."""
 
@@ -45,8 +84,7 @@ class CrossedScene:
     surface: Surface  # of the reference
     bin_px: int
     index: IntArray  # (n,): bins, counted row by row
-    cell: IntArray  # (n,): number of the square of bins, or of what is known of it; ascending
-    offset: Singles  # (2, n): in bins, from the mean place of the cell's bins
+    cells: Cells
     points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
@@ -120,7 +158,7 @@ def scene_of(
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
     known = np.isfinite(coarse).all(axis=0)
-    index, cell, offset = _in_cells(np.flatnonzero(known), columns)
+    index, cells = Cells.of(np.flatnonzero(known), columns)
     grid = bins.BinGrid(tracer.geometry, camera, bin_px)
     points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
@@ -134,8 +172,7 @@ def scene_of(
         surface=shape,
         bin_px=bin_px,
         index=index,
-        cell=cell,
-        offset=offset,
+        cells=cells,
         points=points,
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
@@ -146,16 +183,6 @@ def scene_of(
         rad_per_mm=rad_per_mm,
         half_side_mm=optics.pattern.periods * optics.pattern.period_mm / 2,
     )
-
-
-def _in_cells(index: IntArray, columns: int) -> tuple[IntArray, IntArray, Singles]:
-    """Bins (n,) in the order of their cells, the number of each one's cell, and its offset (2, n) from the cell's mean."""
-    square = index // columns // _CELL * columns + index % columns // _CELL
-    order = np.argsort(square, kind="stable")
-    index, cell = index[order], np.unique(square[order], return_inverse=True)[1]
-    place = np.stack([index % columns, index // columns])
-    mean = np.stack([np.bincount(cell, row) for row in place]) / np.bincount(cell)
-    return index, cell, (place - mean[:, cell]).astype(np.float32)
 
 
 def _pictures(
