@@ -3,8 +3,8 @@
 With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
 W Tukey's weights, which fade where the bins end, and r the residual, a step is (J^T W J)^-1 J^T W r. The matrix is
 kept from step to step and from frame to frame: where J^T W r vanishes is the solution whatever matrix led there. It
-is made anew where steps shrink too slowly. J of a bin is fringes times what changes slowly over the mirror (derivatives
-of the phases, Noll terms): the latter is a plane over a cell of bins, so that all products take a fifth of the time.
+is made anew where steps shrink too slowly. J of a bin is fringes times what changes slowly over the mirror
+(derivatives of the phases, Noll terms): the latter is a plane over a cell of bins, so that products take a fifth.
 
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.metrology.track.scene import CrossedScene
-from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
 
 TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
 _MAX_STEPS = 10
@@ -39,7 +39,6 @@ _TUKEY_SIGMAS = 7.0
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
 _BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
-_STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
 _FAR_RAD = 0.5  # shape beyond 36 terms is less; dust is not
 _FITS, _FAILS = 0.6, 0.1  # mean weights of a bin in a step; one that did now this, now that has changed: dust moved
@@ -247,31 +246,32 @@ class FrameFitter:
             self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
-        gain = self._inverse[:PARAMETERS]
+        gain = self._inverse[:PARAMETERS].astype(np.float32)
+        parts = zip(_STARTS, (*self.jacobian, *[self._basis] * 3), strict=True)
+        slow = np.stack([np.tensordot(gain[:, at : at + PARAMETERS], planes, 1) for at, planes in parts], axis=1)
         waves = self._waves(shifts_rad, fit.surface, fit.light)
-        pulls = self._cells.moments(waves * (self.scene.edge * fit.weights * fit.residual_adu))
-        slow = np.einsum("akiq,aiq->akq", np.stack([*self.jacobian, *[self._basis] * 3]), pulls)
-        columns = np.concatenate([slow[0] + slow[1], *slow[2:]])
-        sums = self.in_squares(gain.astype(np.float32) @ columns)
+        sums = self.in_squares(slow, waves * (self.scene.edge * fit.weights * fit.residual_adu))
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))
         return np.asarray(seen * np.outer(grown, grown))
 
-    def in_squares(self, pull: Singles) -> FloatArray:
-        """Sums (rows, squares) of (rows, N) over squares of the mirror whose errors count as independent.
+    def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
+        """Sums (rows, squares) over squares of the mirror whose errors count as independent.
 
-        Squares of 1.6 fringes fade into their neighbours: what cancels over whole fringes cancels in each. Their sums
-        are as large as those of squares that do not overlap.
+        `slow` (rows, k, 3, N) are what values (k, n) are multiplied by. Squares of 1.6 fringes fade into their
+        neighbours: what cancels over whole fringes cancels in each. Their sums are as large as those of squares that
+        do not overlap.
         """
-        place = (self._cells.planes(self.scene.position_mm)[:, 0] / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
-        low = np.floor(place).astype(int)
-        upper = np.sin(np.pi / 2 * (place - low)) ** 2
+        place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
+        upper = np.sin(np.pi / 2 * np.clip(place - low[:, self._cells.places[0]], 0, 1)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
         side = _BLOCKS + 2
-        number, total = low[1] * side + low[0], np.zeros((len(pull), side**2))
+        number, total = low[1] * side + low[0], np.zeros((len(slow), side**2))
         for share, on in ((left * below, 0), (right * below, 1), (left * above, side), (right * above, side + 1)):
-            total += [np.bincount(number + on, share * row, side**2) for row in pull]
+            pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))
+            total += [np.bincount(number + on, row, side**2) for row in pull]
         return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
 
     def period_um(self) -> FloatArray:
@@ -290,12 +290,6 @@ def _reduced(phase_rad: FloatArray) -> Singles:
     return np.asarray(np.remainder(phase_rad, 2 * math.pi), np.float32)
 
 
-def squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
-    """Number (n,) of the square of the mirror, so many across, that each bin is in; numbers without gaps."""
-    column, row = np.floor((position_mm / radius_mm + 1) / 2 * across).astype(int)
-    return np.unique(row * across + column, return_inverse=True)[1]
-
-
 def separable(shifts_rad: FloatArray) -> bool:
     """Whether steps (N, 2) of x and y separate the two axes."""
     design = _design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
@@ -306,20 +300,6 @@ def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
     """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
     x, y = phase_rad + shifts_rad
     return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
-
-
-def steadied(places_mm: FloatArray, variance_mm2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the mirror was in each of N steps, (N, 36) parameters and their variance, from the steps' own fits.
-
-    Five unknowns of a bin reproduce five steps whatever is assumed of the mirror's motion between them: an error of
-    a step's place becomes an error of all later frames with its shifts. Fits of the steps that scatter as their
-    errors do say that the mirror stood still; the rest is its motion, parameter by parameter.
-    """
-    mean_mm, error_mm2 = places_mm.mean(axis=0), variance_mm2.mean(axis=0)
-    moved_mm = places_mm - mean_mm
-    scatter_mm2 = np.sum(moved_mm**2, axis=0) / (len(places_mm) - 1)
-    share = np.maximum(scatter_mm2 - error_mm2, 0.0) / np.maximum(scatter_mm2, 1e-30)
-    return mean_mm + share * moved_mm, np.maximum(share, _STILL) * variance_mm2
 
 
 def stepped(
@@ -361,6 +341,6 @@ def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tupl
         right = np.einsum("apiq,aiq->p", slow, cells.moments(weight * left_rad), dtype=float)
         moved += np.linalg.solve(matrix, right)
         left_rad = off_rad - cells.spread(np.tensordot(moved, slow, (0, 1)))
-    pull = np.einsum("apiq,aiq->pq", slow, cells.moments(weight * left_rad))  # light that changed between the steps
-    errors = np.linalg.solve(matrix, fitter.in_squares(pull))
+    pull = fitter.in_squares(slow.swapaxes(0, 1), weight * left_rad)  # light that changed between the steps
+    errors = np.linalg.solve(matrix, pull)
     return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

@@ -7,16 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
-from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, squares
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
-from membrane_ctrl.model.arrays import BoolArray, FloatArray, Singles
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
 
 # Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
 _COVERED = 0.25
 _COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
 _DARK = 0.3  # of the reference's light
 _STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
+_STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
 _NONE, _NO_COVARIANCE = np.full(36, math.nan), np.full((36, 36), math.nan)
 
 
@@ -97,6 +98,20 @@ class StandingFrames:
         return FrameFit(shape, self._light / self.count, left, weights, True)
 
 
+def steadied(places_mm: FloatArray, variance_mm2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the mirror was in each of N steps, (N, 36) parameters and their variance, from the steps' own fits.
+
+    Five unknowns of a bin reproduce five steps whatever is assumed of the mirror's motion between them: an error of
+    a step's place becomes an error of all later frames with its shifts. Fits of the steps that scatter as their
+    errors do say that the mirror stood still; the rest is its motion, parameter by parameter.
+    """
+    mean_mm, error_mm2 = places_mm.mean(axis=0), variance_mm2.mean(axis=0)
+    moved_mm = places_mm - mean_mm
+    scatter_mm2 = np.sum(moved_mm**2, axis=0) / (len(places_mm) - 1)
+    share = np.maximum(scatter_mm2 - error_mm2, 0.0) / np.maximum(scatter_mm2, 1e-30)
+    return mean_mm + share * moved_mm, np.maximum(share, _STILL) * variance_mm2
+
+
 class Jumps:
     """By how much the figure jumps at steps of the pattern, beyond what it does from frame to frame.
 
@@ -157,7 +172,7 @@ class Squares:
     """The mirror in squares, each larger than a fringe, for the light of a frame."""
 
     def __init__(self, scene: CrossedScene) -> None:
-        self._number = squares(scene.position_mm, scene.surface.radius_mm, 12)
+        self._number = _squares(scene.position_mm, scene.surface.radius_mm, 12)
         self._count = np.bincount(self._number)
         self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
         self._level = self._means(scene.light_adu[0])
@@ -174,6 +189,12 @@ class Squares:
     def bins(self, chosen: BoolArray) -> BoolArray:
         """The bins (n,) of squares."""
         return np.asarray(chosen[self._number])
+
+
+def _squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
+    """Number (n,) of the square of the mirror, so many across, that each bin is in; numbers without gaps."""
+    column, row = np.floor((position_mm / radius_mm + 1) / 2 * across).astype(int)
+    return np.unique(row * across + column, return_inverse=True)[1]
 
 
 class LostOrders:

@@ -13,7 +13,7 @@ import numpy as np
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track import tracked
-from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, steadied, stepped
+from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
@@ -129,7 +129,9 @@ class Tracker:
         `variance_mm2` are those of the fits' parameters, each (36,).
         """
         old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
-        seen_at, place_mm2 = steadied(np.array([fit.surface.parameters for fit in fits]), np.array(variance_mm2))
+        seen_at, place_mm2 = tracked.steadied(
+            np.array([fit.surface.parameters for fit in fits]), np.array(variance_mm2)
+        )
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
