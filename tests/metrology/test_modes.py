@@ -109,6 +109,17 @@ def test_too_short(seconds: float) -> None:
 
 
 @pytest.mark.campaign
+def test_a_night_of_steps_and_outliers_tells_no_line() -> None:
+    listener = Stethoscope()
+    for seed in range(1000, 1480):
+        time_s, coeffs_um, _ = watched(seed, lines_hz=())
+        rng = np.random.default_rng(seed)
+        coeffs_um += 0.02 * rng.normal(size=(9, 36))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+        coeffs_um[rng.integers(0, time_s.size, 5)] += rng.normal(size=(5, 36))
+        assert listener.search(time_s, coeffs_um) == []
+
+
+@pytest.mark.campaign
 def test_a_hundred_minutes_of_noise_have_no_line_and_sixty_seconds_show_all() -> None:
     assert sum(len(find_modes(*watched(seed, lines_hz=())[:2])) for seed in range(100, 200)) == 0
     seen, errors = 0, []
