@@ -23,7 +23,7 @@ SIZE = {"width": 245, "height": 205, "pixel_um": 34.5}
 
 @dataclass(frozen=True)
 class TrackedErrors:
-    """Errors of m frames and their error bars."""
+    """Errors of the m frames that have a figure, and their error bars; a verdict for every frame."""
 
     time_s: Array  # (m,)
     sag_um: Array  # (m,)
@@ -68,12 +68,13 @@ def errors_of(world: CrossedWorld, folder: Path, time_s: Array, step_every_s: fl
     columns = zernike.values(x, y).T[: -azimuth.size]
     true_um = np.linalg.lstsq(columns, heights_um.T, rcond=None)[0].T
     error_um = found["coeffs_um"] - np.array(result["zernike"]["coeffs_um"]) - true_um
+    given = np.isfinite(found["sag_um"])  # rejected frames have no figure, and count in the share that is ok
     return TrackedErrors(
-        found["time_s"],
-        found["sag_um"] - 1e3 * details["sag_mm"] - rim_um.mean(axis=1),
-        found["sag_sigma_um"],
-        error_um[:, 1:],
-        found["sigma_um"][:, 1:],
+        found["time_s"][given],
+        (found["sag_um"] - 1e3 * details["sag_mm"] - rim_um.mean(axis=1))[given],
+        found["sag_sigma_um"][given],
+        error_um[given, 1:],
+        found["sigma_um"][given, 1:],
         tuple(found["verdict"].tolist()),
     )
 
