@@ -22,6 +22,7 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray
 _RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
 _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
 _UNSEEN_UM = 1000.0  # of the film's motion without a laser, before the fringes are asked
+_PATCHES = 12  # a side, of the picture: coarser than fringes
 _UNKNOWN_UM = 20.0  # of the film's place without a laser: a hold, or a mirror left alone for minutes
 _SIGMAS = 4.0  # of the fringes' answer: the film moved
 # the fringes' error in the film's place at a frame, the share of a motion within an axis that its correction leaves,
@@ -103,8 +104,16 @@ def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
         variance = float(np.mean((left - inputs @ answer) ** 2))
         covariance = np.linalg.inv(gram / variance + np.eye(inputs.shape[1]))
         answer = covariance @ (inputs.T @ left) / variance
-    noise = covariance @ (gram / variance) @ covariance
-    moved_um, *sigmas = answer[-1], math.sqrt(covariance[-1, -1]), math.sqrt(noise[-1, -1])
+    noise = float((covariance @ (gram / variance) @ covariance)[-1, -1])
+    # uneven light and a bent response leave residuals that neighbours share: sums over patches scatter by more
+    shares = (covariance[-1] @ inputs.T / variance * (left - inputs @ answer)).reshape(2, -1)
+    patch = np.ravel_multi_index(
+        [np.int64((_PATCHES - 1e-6) * (p - p.min()) / np.ptp(p)) for p in (bench.row_px, bench.column_px)],
+        (_PATCHES, _PATCHES),
+    )
+    patches = sum(float(np.sum(np.bincount(patch, share) ** 2)) for share in shares)
+    more = max(patches - noise, 0.0)
+    moved_um, *sigmas = answer[-1], math.sqrt(covariance[-1, -1] + more), math.sqrt(noise + more)
     return UnseenMotion(*(_UNSEEN_UM * float(value) for value in (moved_um, *sigmas)))
 
 

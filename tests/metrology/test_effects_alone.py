@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.effects import EFFECTS, Effect, answer
+from membrane_ctrl.cli import run
+from membrane_ctrl.model.errors import Exit
+from tests.support.crossed_world import CrossedWorld
+from tests.support.tracked_errors import CLEAN, SIZE
 
 BY_NAME = {effect.says: effect for effect in EFFECTS}
 
@@ -32,3 +39,12 @@ def test_a_film_that_moved_without_a_laser_is_in_the_bar_of_its_sag(moved_um: in
 )
 def test_what_a_set_says_of_itself_is_in_its_verdict(name: str, doubt: str) -> None:
     assert_held(BY_NAME[name], doubt)
+
+
+def test_a_resting_film_with_a_figure_of_its_own_has_not_moved(tmp_path: Path) -> None:
+    """Its ripple is no term of the fit, and no motion: it counted as 26 +- 6 um of it."""
+    world = CrossedWorld(seed=1, **(SIZE | CLEAN), bits=16, noise_adu=0.05)  # type: ignore[arg-type]
+    world.write_reference(tmp_path / "full")
+    assert run(["measure", str(tmp_path / "full"), "--no-pictures"]) == Exit.DONE
+    result = json.loads((tmp_path / "full" / "result" / "result.json").read_text())
+    assert "the film moved" not in result["quality"]["reason"]
