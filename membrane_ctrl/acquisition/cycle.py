@@ -8,6 +8,7 @@ and reports the failures.
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol
@@ -42,6 +43,9 @@ class Reconstructor(Protocol):
 
     def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
         """Figure from the frames after a full cycle alone, tracked against the last absolute phase."""
+
+    def prepare(self) -> None:
+        """Do ahead what the next figure needs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +130,11 @@ class ShapeCycle:
         self._failed_in_a_row = 0
         self._judge(estimate)
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
+
+    def prepare(self) -> None:
+        """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a failure."""
+        with suppress(exposures.StageError), exposures.during("reconstruction"):
+            self._reconstructor.prepare()
 
     def _judge(self, estimate: ShapeEstimate) -> None:
         """Decide the kind of the next cycle."""
@@ -231,6 +240,7 @@ def keep_cycling(
             remote.tell(_captured(result, keep))
         pause_s = result.pause_s if result is not None else 0.0
         due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
+        taking.prepare()
 
 
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:

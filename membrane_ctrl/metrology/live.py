@@ -132,6 +132,9 @@ class LiveReconstructor:
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         return self._follow("fringes", self._tracked, times, readings)
 
+    def prepare(self) -> None:
+        """A cycle needs nothing ahead."""
+
     def height_map(
         self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -95,6 +95,12 @@ class FakeReconstructor:
     verdicts: list[tuple[Verdict, str]] = field(default_factory=list)
     calls: list[Call] = field(default_factory=list)
     singular: bool = False
+    prepared: int = 0
+
+    def prepare(self) -> None:
+        self.prepared += 1
+        if self.singular:
+            raise np.linalg.LinAlgError("singular matrix")
 
     def full(
         self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]

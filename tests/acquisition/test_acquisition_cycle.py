@@ -168,6 +168,13 @@ def test_numerics_that_raise_are_an_event(bench: Bench) -> None:
     assert (failure.stage, failure.message) == ("reconstruction", "LinAlgError: singular matrix")
 
 
+def test_a_failure_ahead_of_a_cycle_is_told_by_the_cycle(bench: Bench) -> None:
+    bench.reconstructor.singular = True
+    bench.cycle.prepare()
+    assert bench.reconstructor.prepared == 1
+    assert bench.failed().stage == "reconstruction"
+
+
 def test_camera_with_pixels_of_its_own_is_copied(bench: Bench) -> None:
     bench.camera.own_pixels = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     bench.done()

@@ -53,6 +53,12 @@ class ScriptedCycle:
         self.started_s: list[float] = []
         self.results: list[CycleDone | CycleFailed | None] = []
         self.full_wanted_at_s: list[float] = []
+        self.prepared_s: list[float] = []
+        self.prepares_s: list[float] = []
+
+    def prepare(self) -> None:
+        self.prepared_s.append(self.clock.now_s)
+        self.clock.sleep(self.prepares_s.pop(0) if self.prepares_s else 0.0)
 
     def take(self) -> CycleDone | CycleFailed | None:
         self.started_s.append(self.clock.now_s)
@@ -91,6 +97,14 @@ def test_slow_cycle_skips_deadlines_and_makes_none_up() -> None:
     loop = Loop({9.0: "stop"}, duration_s=2.5)
     loop.run()
     assert loop.cycle.started_s == [0, 4, 8]
+
+
+def test_the_next_cycle_is_prepared_once_the_figure_is_out_and_starts_late_at_worst() -> None:
+    loop = Loop({7.0: "stop"})
+    loop.cycle.prepares_s = [0.0, 1.8]
+    loop.run()
+    assert loop.cycle.started_s == [0, 2, 4.3, 6]
+    assert loop.cycle.prepared_s == [0.5, 2.5, 4.8, 6.5]  # half a second after the start: the figure is out
 
 
 def test_pause_and_resume() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -123,6 +123,23 @@ def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
     assert np.median(sigma) < 0.002
     jumps.begin()  # what was before is no jump
     assert not jumps.add((9.0, 0.0), np.ones(36))
+
+
+def test_what_the_next_frame_needs_may_be_made_ahead(bench: Bench) -> None:
+    """The figures are the same, and no more is left to the frame that follows."""
+    shifts = [(float(x), float(y)) for x, y in STEPS for _ in range(2)] + [STILL] * 2
+    pictures = [bench.frame(shifts=one) for one in shifts]
+    late, ahead = deepcopy(bench.prepared), deepcopy(bench.prepared)
+    found = []
+    for k, (picture, shown) in enumerate(zip(pictures, shifts, strict=True)):
+        ahead.prepare(shown)
+        scene = ahead._fitter.scene
+        found.append([one.follow(picture, shown, 0.1 * k) for one in (late, ahead)])
+        assert ahead._fitter.scene is scene
+    for one, other in found:
+        assert np.array_equal(one.coeffs_um, other.coeffs_um)
+        assert one.sag_sigma_um == other.sag_sigma_um
+    assert late._fitter.scene is not bench.scene
 
 
 def hand(frame: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:

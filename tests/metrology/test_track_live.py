@@ -40,6 +40,7 @@ class Bench:
         self.time_s, self.rate_hz = 0.0, RATE_HZ
         self.shown: list[Pattern] = []
         self.stains: NDArray[np.float64] | float = 1.0
+        self.picture: NDArray[np.uint8] = np.zeros(0, np.uint8)
 
     def full(self, moved_um: float = 0.0) -> ShapeEstimate:
         frames = [self.renderer.render(p, moved_um) for p in phase.full_sequence(OPTICS.pattern)]
@@ -47,11 +48,15 @@ class Bench:
         return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
 
     def frame(self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0) -> ShapeEstimate:
+        picture = self.renderer.render(self.tracker.pattern, moved_um, gain=gain)
+        self.picture = np.rint(picture * self.stains).clip(0, 255).astype(np.uint8)
+        return self.again(reading_um)
+
+    def again(self, reading_um: float = math.nan) -> ShapeEstimate:
+        """The last picture as the next frame."""
         self.time_s += 1 / self.rate_hz
         self.shown.append(self.tracker.pattern)
-        picture = self.renderer.render(self.tracker.pattern, moved_um, gain=gain)
-        picture = np.rint(picture * self.stains).clip(0, 255).astype(np.uint8)
-        return self.tracker.fringes([picture], np.array([self.time_s]), np.array([reading_um]))
+        return self.tracker.fringes([self.picture], np.array([self.time_s]), np.array([reading_um]))
 
     def frames(self, count: int, moved_um: float = 0.0, **given: float) -> list[ShapeEstimate]:
         return [self.frame(moved_um, **given) for _ in range(count)]
@@ -109,6 +114,16 @@ def test_the_pattern_steps_at_first_and_then_now_and_then(bench: Bench) -> None:
     assert np.diff([5, *changes]).tolist() == pytest.approx([STEP_S * RATE_HZ] * 2, abs=1)
     turns = np.array([[p.shift_rad, p.shift_y_rad] for p in first]) * 5 / (2 * math.pi)
     assert turns.tolist() == [[0, 0], [1, 2], [2, 4], [3, 1], [4, 3]]
+
+
+def test_a_camera_that_freezes_while_the_pattern_steps_is_frozen_and_no_knock(bench: Bench) -> None:
+    """Where five steps renewed the light, the frozen frame fitted as a tilt by a fifth of a period."""
+    steps = 0
+    while steps < 10:
+        assert bench.frame().verdict == "ok"
+        steps += bench.tracker.pattern != bench.shown[-1]
+    found = [bench.again(), bench.again(), bench.frame()]
+    assert [(e.verdict, e.reason.split(":")[0]) for e in found] == [("rejected", "frozen")] * 2 + [("ok", "")]
 
 
 def test_a_bent_response_of_the_panel_turns_no_tilt() -> None:

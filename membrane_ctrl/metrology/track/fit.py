@@ -152,6 +152,10 @@ class FrameFitter:
             self._inverse = None
         return found
 
+    def prepare(self, shifts_rad: tuple[float, float], start: FrameFit) -> None:
+        """Make the matrix for frames with these phase steps that will be fitted from `start`."""
+        self._inverse = self._inverted(shifts_rad, start.surface, start.light, start.weights)
+
     def _descend(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach: FloatArray, patient: bool
     ) -> FrameFit:

@@ -113,6 +113,11 @@ class LiveTracker:
             found = replace(found, covariance_um2=self._covariance_um2)
         return _estimate(found, reading_um, self._astray(found), self._urad_per_rad)
 
+    def prepare(self) -> None:
+        """Do ahead what the next frame needs, while its pattern settles."""
+        if self._tracker is not None:
+            self._tracker.prepare((self.pattern.shift_rad, self.pattern.shift_y_rad))
+
     def _anchored(self, frames: Sequence[Image], displacement_um: FloatArray) -> Tracker:
         """A tracker that begins with the figure of a full cycle. Raises NoFigureError, ValueError."""
         optics = self._optics
