@@ -34,7 +34,7 @@ def _bessel(lobes: int, circles: int) -> Array:
     rms = abs(special.jv(lobes + 1, zero)) * (math.sqrt(0.5) if lobes else 1.0)
     series = [(-1) ** k * (zero / 2) ** (2 * k + lobes) / (special.factorial(k) * special.factorial(k + lobes))
               for k in range(14)]  # fmt: skip
-    return np.array(series[::-1]) / rms
+    return np.asarray(np.array(series[::-1]) / rms)
 
 
 _BESSEL = [_bessel(lobes, circles) for _, lobes, circles in DRUM]
@@ -86,6 +86,14 @@ class CrossedWorld:
     b_mm: float = 2871.0
     alpha_deg: float = 80.9
     sag_mm: float = 37.1
+    astigmatism_mm: tuple[float, float] = (0.25, 0.1)
+    coma_mm: float = 0.05
+    ripple_mm: float = 0.004
+    ripple_waves: tuple[float, float] = (3.0, 5.0)  # radians over the radius along x, y
+    side_mm: float = SIDE_MM  # of the pattern
+    crossed_periods: int = CROSSED
+    contrast: float = 1.0  # of the crossed pattern
+    laser_um: float = math.nan  # noise of the laser's readings; NaN gives none
     drift_um_per_s: float = 0.002
     swing_um: float = 0.3
     shimmer_um: float = 0.1  # swing of astigmatism and coma
@@ -109,7 +117,7 @@ class CrossedWorld:
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng(self.seed)
-        self._light = Waves(self.brightness, 75.0, 60.0, SIDE_MM / 2, self.seed + 1)
+        self._light = Waves(self.brightness, 75.0, 60.0, self.side_mm / 2, self.seed + 1)
         self._air = (
             Waves(self.air_um, 400.0, 0.5, RADIUS_MM, self.seed + 2),
             Waves(self.air_um, 400.0, 0.5, RADIUS_MM, self.seed + 3),
@@ -132,8 +140,9 @@ class CrossedWorld:
         swing = [
             1e-3 * self.shimmer_um * np.sin(w * t + p) for w, p in zip((1.3, 2.1, 0.9), self._phase[1:], strict=True)
         ]
-        out = 1e-3 * self.sag_um(t) * bowl + (0.25 + swing[0]) * (u * u - v * v) + (0.1 + swing[1]) * 2 * u * v
-        out = out + (0.05 + swing[2]) * u * (3 * q - 2) + 0.004 * np.cos(3.0 * u + 5.0 * v)
+        out = 1e-3 * self.sag_um(t) * bowl + (self.astigmatism_mm[0] + swing[0]) * (u * u - v * v)
+        out = out + (self.astigmatism_mm[1] + swing[1]) * 2 * u * v + (self.coma_mm + swing[2]) * u * (3 * q - 2)
+        out = out + self.ripple_mm * np.cos(self.ripple_waves[0] * u + self.ripple_waves[1] * v)
         for k, (hz, lobes, _) in enumerate(DRUM if self.drum_nm else ()):
             part = np.polyval(_BESSEL[k], q) * (1.0, u, u * u - v * v)[lobes]
             out = out + 1e-6 * self.drum_nm * np.sin(2 * math.pi * hz * t + k) * part
@@ -188,11 +197,11 @@ class CrossedWorld:
         """What the camera sees of a pattern, a function of s_x and s_y from the low edge that gives 0 to 1."""
         rows = t + self.rolling_s * np.linspace(-0.5, 0.5, self.height)[:, None] if self.rolling_s else t
         s_x, s_y, x, y, inside = self.trace(rows)
-        level = np.clip(pattern(s_x + SIDE_MM / 2, s_y + SIDE_MM / 2), 0, 1)
+        level = np.clip(pattern(s_x + self.side_mm / 2, s_y + self.side_mm / 2), 0, 1)
         lit = level + self.bend * np.sin(math.pi * level) ** 2
         if self.brightness:
             lit = lit * (1 + self._light.at(t, s_x, s_y))
-        shown = np.maximum(np.abs(s_x), np.abs(s_y)) < SIDE_MM / 2
+        shown = np.maximum(np.abs(s_x), np.abs(s_y)) < self.side_mm / 2
         lit = np.where(shown, 0.02 + 0.98 * lit * (1 - self.dim_per_s * t), 0.02)
         if self._dust.shape != x.shape:
             self._dust = np.ones(x.shape)
@@ -204,7 +213,7 @@ class CrossedWorld:
         counts = 5 + np.where(inside, room + 190 * gain * lit * corner, 0.0)
         counts += self._random.normal(0, self.noise_adu, counts.shape)
         full = 2**self.bits - 1
-        return np.rint(counts * full / 255).clip(0, full).astype(np.uint8 if self.bits == 8 else np.uint16)
+        return np.asarray(np.rint(counts * full / 255).clip(0, full), np.uint8 if self.bits == 8 else np.uint16)
 
     def _backlight(self, t: Any) -> Any:
         """Light of an exposure whose middle is `t`, over the mean."""
@@ -220,31 +229,39 @@ class CrossedWorld:
 
     def crossed(self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0) -> NDArray[Any]:
         """A frame of the crossed pattern, which has been shown since the frame before."""
-        rate = 2 * math.pi * CROSSED / SIDE_MM
+        rate = 2 * math.pi * self.crossed_periods / self.side_mm
         keep = math.exp(-(t - self._shown_s) / self.sticking_s)
         self._burnt, self._shown_s = keep * self._burnt + (1 - keep) * np.exp([1j * shift_x, 1j * shift_y]), t
 
         def pattern(s_x: Array, s_y: Array) -> Array:
             turns = [rate * s - math.pi for s in (s_x, s_y)]
-            shown = 0.5 + (np.cos(turns[0] + shift_x) + np.cos(turns[1] + shift_y)) / 4
+            shown = 0.5 + self.contrast * (np.cos(turns[0] + shift_x) + np.cos(turns[1] + shift_y)) / 4
             if self.sticking:
-                stuck = [np.real(b * np.exp(1j * turn)) for b, turn in zip(self._burnt, turns, strict=True)]
+                stuck = [
+                    self.contrast * np.real(b * np.exp(1j * turn)) for b, turn in zip(self._burnt, turns, strict=True)
+                ]
                 shown = shown * (1 - self.sticking * (0.5 + (stuck[0] + stuck[1]) / 4))
             return np.asarray(shown)
 
         return self.frame(t, pattern, gain)
 
+    def _laser(self, t: float) -> dict[str, float]:
+        """The reading of a row, against the film at rest."""
+        if math.isnan(self.laser_um):
+            return {}
+        return {"displacement_um": float(self.sag_um(t) - 1e3 * self.sag_mm + self._random.normal(0, self.laser_um))}
+
     def _table(self, kind: str) -> dict[str, Any]:
-        pattern = {"steps": 4, "periods": PERIODS, "period_mm": PERIOD_MM}
+        pattern = {"steps": 4, "periods": PERIODS, "period_mm": self.side_mm / PERIODS}
         return {"schema": "membrane-capture/1", "kind": kind, "pattern": pattern}
 
     def write_reference(self, folder: Path, t: float = 0.0) -> None:
         """Write the 18 frames of a full set, the film at rest."""
         folder.mkdir(parents=True)
         rows = []
-        for name, row, pattern in _full():
+        for name, row, pattern in _full(self.side_mm / PERIODS):
             cv2.imwrite(str(folder / f"{name}.png"), self.frame(t, pattern))
-            rows.append({"file": f"{name}.png", **row})
+            rows.append({"file": f"{name}.png", **row, **self._laser(t)})
         table = self._table("full")
         table["geometry"] = {"a_mm": self.a_mm, "b_mm": self.b_mm, "alpha_deg": self.alpha_deg}
         table["camera"] = {
@@ -255,23 +272,28 @@ class CrossedWorld:
         table["frames"] = rows
         (folder / "capture.toml").write_text(tomli_w.dumps(table))
 
-    def write_track(self, folder: Path, times: Array, step_every_s: float = 10.0, dust_every: int = 25) -> None:
-        """Write a tracking set beside `full`: five steps, then a pattern that stands still from step to step."""
+    def write_track(
+        self, folder: Path, times: Array, step_every_s: float = 10.0, dust_every: int = 25, first_steps: int = 5
+    ) -> None:
+        """Write a tracking set beside `full`: first steps, then a pattern that stands still from step to step."""
         folder.mkdir(parents=True)
         rows, step, stepped_s = [], -1, -math.inf
         for k, t in enumerate(times):
             if self.dust and k % dust_every == dust_every - 1:
                 self.move_dust()
-            if k < 5 or t - stepped_s >= step_every_s:
+            if k < first_steps or t - stepped_s >= step_every_s:
                 step, stepped_s = step + 1, float(t)
             shift_x, shift_y = 2 * math.pi * (step % 5) / 5, 2 * math.pi * (2 * step % 5) / 5
             cv2.imwrite(str(folder / f"t{k}.png"), self.crossed(float(t), shift_x, shift_y))
             rows.append({
                 "file": f"t{k}.png", "role": "crossed", "shift_x_rad": shift_x, "shift_y_rad": shift_y,
-                "time_s": float(t),
+                "time_s": float(t), **self._laser(float(t)),
             })  # fmt: skip
         table = self._table("track") | {"reference": "../full", "frames": rows}
-        table["pattern"]["crossed"] = {"periods": CROSSED, "period_mm": SIDE_MM / CROSSED}
+        table["pattern"]["crossed"] = {
+            "periods": self.crossed_periods, "period_mm": self.side_mm / self.crossed_periods,
+            "contrast": self.contrast,
+        }  # fmt: skip
         (folder / "capture.toml").write_text(tomli_w.dumps(table))
 
     def height_um(self, t: float, x: Array, y: Array) -> Array:
@@ -280,9 +302,9 @@ class CrossedWorld:
         return 1e3 * (self.film_mm(x, y, t) - self.film_mm(zero, zero, t))
 
 
-def _full() -> Any:
+def _full(period_mm: float) -> Any:
     """Names, rows and patterns of a full set."""
-    rate = 2 * math.pi / PERIOD_MM
+    rate = 2 * math.pi / period_mm
     for axis in ("x", "y"):
 
         def along(s_x: Array, s_y: Array, axis: str = axis) -> Array:
@@ -297,7 +319,7 @@ def _full() -> Any:
         for bit in range(1, 5):
 
             def gray(s_x: Array, s_y: Array, bit: int = bit, along: Any = along) -> Array:
-                half = np.clip(np.floor(2 * along(s_x, s_y) / PERIOD_MM), 0, 15).astype(int)
+                half = np.clip(np.floor(2 * along(s_x, s_y) / period_mm), 0, 15).astype(int)
                 return np.asarray(((half ^ (half >> 1)) >> (4 - bit)) & 1, float)
 
             yield f"{axis}g{bit}", {"role": "gray", "axis": axis, "index": bit}, gray

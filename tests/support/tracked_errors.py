@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.metrology.optics import zernike
@@ -31,6 +32,8 @@ class TrackedErrors:
     terms_um: Array  # (m, 35): Noll 2 to 36
     terms_sigma_um: Array
     verdicts: tuple[str, ...]
+    reasons: tuple[str, ...]
+    given: NDArray[np.bool_]  # (frames,): which have a figure
 
     @property
     def ok_share(self) -> float:
@@ -54,6 +57,11 @@ def errors_of(world: CrossedWorld, folder: Path, time_s: Array, step_every_s: fl
     world.write_track(folder / "track", time_s, step_every_s)
     assert run(["measure", str(folder / "full"), "--no-pictures"]) == 0
     assert run(["track", str(folder / "track"), "--no-pictures"]) == 0
+    return compared(world, folder)
+
+
+def compared(world: CrossedWorld, folder: Path) -> TrackedErrors:
+    """The results of both commands against the world's truth."""
     result, details = (
         json.loads((folder / f"full/result/{name}.json").read_text()) for name in ("result", "details")
     )
@@ -76,6 +84,8 @@ def errors_of(world: CrossedWorld, folder: Path, time_s: Array, step_every_s: fl
         error_um[given, 1:],
         found["sigma_um"][given, 1:],
         tuple(found["verdict"].tolist()),
+        tuple(found["reason"].tolist()),
+        given,
     )
 
 
