@@ -93,7 +93,8 @@ class CrossedScene:
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
     basis: Singles  # (36, n): Noll terms at the bins, for what changes smoothly
-    edge: Singles  # (n,): weight, which fades to 0 where the bins end
+    taper: Singles  # (n,): weight, which fades to 0 where the bins end
+    edge: Singles  # (n,): the same, 0 for bins that changed between the last five steps
     position_mm: FloatArray  # (2, n): on the mirror
     # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5; zeros if straight
     response: FloatArray
@@ -171,6 +172,7 @@ def scene_of(
     seen_rad = tracer.predict_screen(points, shape) * rad_per_mm
     fringe = 2 * math.pi / _rad_per_bin(index, (rows, columns), seen_rad, _USUAL)
     inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[1:-1, 1:-1].reshape(-1)[index]
+    taper = np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2).astype(np.float32) ** 2
     return CrossedScene(
         tracer=tracer,
         surface=shape,
@@ -181,7 +183,8 @@ def scene_of(
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
         basis=zernike.values(*position / shape.radius_mm).astype(np.float32),
-        edge=np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2).astype(np.float32) ** 2,
+        taper=taper,
+        edge=taper,
         position_mm=position,
         response=response,
         rad_per_mm=rad_per_mm,

@@ -71,6 +71,7 @@ class Tracker:
         self._anchor_light = math.nan
         self._orders = tracked.LostOrders(self._fitter)
         self._knocked = ""
+        self._mean_place: tuple[float, FloatArray] | None = None  # its time, parameters: of the last five steps
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
         self._covariance_um2, self._covariance_s = np.full((36, 36), math.nan), -math.inf
         self._sag_sigma_um = math.nan
@@ -117,11 +118,13 @@ class Tracker:
             return found
         shown = [(float(x), float(y)) for x, y in shifts_rad]
         errors_mm2 = np.diag(self._fitter.covariance_mm2(self._last, shown[-1], self._noise_adu))
-        moved = self._renew(fits, [errors_mm2] * len(fits), np.stack(seen), shown)
+        moved = self._renew(time_s, fits, [errors_mm2] * len(fits), np.stack(seen), shown)
+        self._mean_place = None  # a few frames tell no drift
         return [tracked.moved_frame(frame, moved, self._last.surface.radius_mm) for frame in found]
 
     def _renew(
         self,
+        time_s: FloatArray,
         fits: list[FrameFit],
         variance_mm2: list[FloatArray],
         seen_adu: Singles,
@@ -132,12 +135,13 @@ class Tracker:
         `variance_mm2` are those of the fits' parameters, each (36,).
         """
         old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
-        seen_at, place_mm2 = tracked.steadied(
-            np.array([fit.surface.parameters for fit in fits]), np.array(variance_mm2)
-        )
+        fitted = np.array([fit.surface.parameters for fit in fits])
+        drifted_mm = np.outer(time_s, self._drift_mm_per_s(float(np.mean(time_s)), fitted.mean(axis=0)))
+        seen_at, place_mm2 = tracked.steadied(fitted, np.array(variance_mm2), drifted_mm)
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
+        self._mean_place = float(np.mean(time_s)), seen_at.mean(axis=0) + moved
         self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
         self._anchor_light /= float(np.median(scene.light_adu[0] / old.light_adu[0]))  # light counts from the scene's
         parameters = self._last.surface.parameters + moved
@@ -145,11 +149,22 @@ class Tracker:
         self._begin(scene, shape, np.mean([fit.light for fit in fits], axis=0))
         return moved
 
-    def _remember(self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit) -> None:
+    def _drift_mm_per_s(self, time_s: float, place_mm: FloatArray) -> FloatArray:
+        """Of the parameters (36,), from the mean place in the last five steps to that in these.
+
+        The mean of five steps is free of the errors of each. Taken from the steps themselves, a drift was lost in
+        these errors: 0.1 um in a cycle of five became a saw-tooth of as much.
+        """
+        if self._mean_place is None:
+            return np.zeros(surface.PARAMETERS)
+        before_s, before_mm = self._mean_place
+        return np.asarray((place_mm - before_mm) / (time_s - before_s))
+
+    def _remember(self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit, time_s: float) -> None:
         """Add a good frame to its step."""
         if not self._steps or self._steps[-1].shifts_rad != shifts_rad:
             self._steps = [*self._steps[1 - ENOUGH_STEPS :], tracked.StandingFrames(shifts_rad)]
-        self._steps[-1].add(seen_adu, fit)
+        self._steps[-1].add(seen_adu, fit, time_s)
 
     def prepare(self, shifts_rad: tuple[float, float]) -> None:
         """Do ahead what the next frame, with these phase steps of x and y, needs.
@@ -178,7 +193,8 @@ class Tracker:
         shown = [step.shifts_rad for step in steps]
         if separable(np.array(shown)):
             fits, variance_mm2 = [step.fit(radius_mm) for step in steps], [step.variance_mm2 for step in steps]
-            self._renew(fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown)
+            times_s = np.array([step.time_s for step in steps])
+            self._renew(times_s, fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown)
 
     def _place_mm2(self, shifts_rad: tuple[float, float]) -> FloatArray:
         """Variance (36,) of the place at which the steps saw the mirror with these shifts, common to their frames."""
@@ -226,7 +242,7 @@ class Tracker:
         self._accept(fit, light, shifts_rad, time_s, displacement_um)
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
-            self._remember(shifts_rad, seen, fit)
+            self._remember(shifts_rad, seen, fit, time_s)
         found = self._result(fit, shifts_rad, time_s, worst, rest)
         return replace(found, saturated_share=float(np.mean(saturated)))
 
@@ -273,12 +289,14 @@ class Tracker:
     def _robust(
         self, seen: Singles, shifts_rad: tuple[float, float], start: FrameFit, left_out: BoolArray
     ) -> FrameFit:
-        """Fit with Tukey's weights, at first of the last frame's scale: a film that moved needs all bins to begin."""
+        """Fit without outliers, at first of the last frame's scale: a film that moved needs all bins to begin."""
         fit = start
+        # light wanders in proportion to itself: bright fringes in a bright patch are no outliers
+        bright = np.maximum(seen / self._fitter.scene.light_adu[0], 1.0)
         for first in filter(None, (self._scale_adu, _FIRST_REACH)):
             fit, scale = start, first
             for _ in range(4):
-                fit = self._fitter.fit(seen, shifts_rad, fit, np.where(left_out, 0.0, _REACH_SIGMAS * scale))
+                fit = self._fitter.fit(seen, shifts_rad, fit, np.where(left_out, 0.0, _REACH_SIGMAS * scale * bright))
                 found = self._scale_of(fit)
                 if 0.67 * scale < found < 1.5 * scale or self._lost(fit):
                     break
