@@ -108,12 +108,12 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     reference = Figures(geometry).of(reference_of(content.reference, folder, path))
     _require_reference(content, reference, path)
     crossed, optics = content.pattern.crossed, reference.head.optics
+    size = (optics.camera.height_px, optics.camera.width_px)
     try:
         scene = scene_of(optics, reference.checked, _measured(reference), crossed.period_mm, crossed.contrast)
+        tracker = Tracker(scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um)
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
-    size = (optics.camera.height_px, optics.camera.width_px)
-    tracker = Tracker(scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um)
     shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
     pictures = _pictures(content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16))
     times = np.array([row.time_s for row in content.frames])

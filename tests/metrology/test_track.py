@@ -14,7 +14,7 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracked import Jumps, TrackedFrame
+from membrane_ctrl.metrology.track.tracked import Jumps, LostOrders, TrackedFrame
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
@@ -142,10 +142,14 @@ def test_what_the_next_frame_needs_may_be_made_ahead(bench: Bench) -> None:
     assert late._fitter.scene is not bench.scene
 
 
-def hand(frame: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
+def hand(frame: NDArray[np.uint8], columns: int, light_adu: float = 9) -> NDArray[np.uint8]:
     out = frame.copy()
-    out[60:140, 60 : 60 + columns] = 9
+    out[60:140, 60 : 60 + columns] = round(light_adu)
     return out
+
+
+def noisy_grey(light_adu: float) -> NDArray[np.uint8]:
+    return np.random.default_rng(7).normal(light_adu, 1.0, SIZE).astype(np.uint8)
 
 
 def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
@@ -156,6 +160,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     faulty = {
         "frozen": lambda: good,
         "hand": lambda: hand(bench.frame(), 40),
+        "grey hand": lambda: hand(bench.frame(), 40, float(np.median(bench.scene.light_adu[0]))),
         "body": lambda: hand(bench.frame(), 100),
         "dark": lambda: bench.frame(gain=0.1),
         "bright": lambda: bench.frame(gain=2.5),
@@ -165,6 +170,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "tilt by half a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM / 2})),
         "knock": lambda: bench.frame(film=with_terms({3: 20.0})),
         "blank": lambda: np.full(SIZE, 120, np.uint8),
+        "blank screen": lambda: noisy_grey(float(np.median(bench.scene.light_adu[0]))),
     }
     return tracker.follow(faulty[name](), STILL, 0.05), tracker.follow(bench.frame(2.0), STILL, 0.1)
 
@@ -174,6 +180,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     [
         ("frozen", "rejected", "frozen"),
         ("hand", "degraded", "covered"),
+        ("grey hand", "rejected", "covered: without"),
         ("body", "rejected", "covered"),
         ("dark", "rejected", "dark"),
         ("bright", "rejected", "saturated"),
@@ -183,6 +190,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("tilt by half a period", "rejected", "order lost"),
         ("knock", "degraded", "knocked"),
         ("blank", "rejected", "no fringes"),
+        ("blank screen", "rejected", "no fringes"),
     ],
 )
 def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, verdict: str, reason: str) -> None:
@@ -192,6 +200,14 @@ def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, ve
     named = {"exposure": "exposure changed", "knock": "knocked"}.get(name, "")  # light returns; a knock remains
     assert (after.verdict, after.reason[: len(named)]) == ("degraded" if named else "ok", named), after.reason
     assert after.sag_um - 1e3 * bench.scene.surface.sag_mm == pytest.approx(2.0, abs=0.2)
+
+
+def test_fringes_of_which_a_lost_period_looks_like_a_film_are_refused(bench: Bench) -> None:
+    orders = LostOrders(bench.prepared._fitter)
+    orders.require_telling()
+    orders._lost_um = 0.02 * orders._lost_um  # as much finer
+    with pytest.raises(ValueError, match="use a longer period"):
+        orders.require_telling()
 
 
 def jumps(bench: Bench, count: int, seed: int) -> list[str]:

@@ -14,7 +14,9 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
 
 # Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
 _COVERED = 0.25
-_COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
+_COVERED_REJECTED, COVERED_DEGRADED = 0.25, 0.02
+_GREY = 0.3  # contrast of a square against the median's: less is no fringe but a grey thing before it
+_UNEVEN = 0.1  # of a square's light: as much of a fringe does not average out in it
 _DARK = 0.3  # of the reference's light
 _STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
 _STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
@@ -174,19 +176,29 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fin
         (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
         (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
         (saturated > degraded, "degraded", f"saturated: {saturated:.1%} of the bins"),
-        (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
+        (share > COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
     )
     return [Finding(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
 
 
 class Squares:
-    """The mirror in squares, each larger than a fringe, for the light of a frame."""
+    """The mirror in squares, for the light of a frame.
+
+    Where the film's slopes spread the fringes, a square shows parts of one, and its light depends on the phase: by
+    that much more it may differ.
+    """
 
     def __init__(self, scene: CrossedScene) -> None:
         self._number = _squares(scene.position_mm, scene.surface.radius_mm, 12)
         self._count = np.bincount(self._number)
         self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
         self._level = self._means(scene.light_adu[0])
+        waves = scene.light_adu[1:] * np.exp(1j * scene.phase_rad(scene.surface))
+        parts = [np.hypot(self._means(wave.real), self._means(wave.imag)) for wave in waves]
+        self._fringe = np.sum(parts, axis=0) / self._level  # that does not average out
+        self._even = self._whole & (self._fringe <= max(_UNEVEN, float(np.median(self._fringe[self._whole]))))
+        self._light_adu = scene.light_adu[0]
+        self._swing = np.sqrt(self._means(np.sum((scene.light_adu[1:] / self._light_adu) ** 2, axis=0)) / 2)
 
     def _means(self, values: FloatArray | Singles) -> FloatArray:
         return np.asarray(np.bincount(self._number, values) / self._count)
@@ -194,8 +206,21 @@ class Squares:
     def look(self, seen: Singles) -> tuple[float, BoolArray]:
         """Light of a frame over the scene's, and the squares whose light is wrong."""
         share = self._means(seen) / self._level
-        light = float(np.median(share[self._whole]))
-        return light, self._whole & (np.abs(share - light) > _COVERED * max(light, 1e-6))
+        light = float(np.median(share[self._even]))
+        wrong = np.abs(share - light) > (_COVERED + self._fringe) * max(light, 1e-6)
+        contrast = self._contrasts(seen)
+        grey = self._even & (contrast < _GREY * float(np.median(contrast[self._even])))
+        return light, self._whole & (wrong | grey)
+
+    def contrast(self, seen: Singles) -> float:
+        """Of the fringes of a frame, whatever their phases, over the scene's."""
+        return float(np.median(self._contrasts(seen)[self._even]))
+
+    def _contrasts(self, seen: Singles) -> FloatArray:
+        share = seen / self._light_adu
+        mean = self._means(share)
+        scatter = np.sqrt(np.maximum(self._means(share**2) - mean**2, 0.0))
+        return np.asarray(scatter / self._swing / np.maximum(mean, 1e-6))
 
     def bins(self, chosen: BoolArray) -> BoolArray:
         """The bins (n,) of squares."""
@@ -217,6 +242,17 @@ class LostOrders:
         x, y = fitter.period_um()
         pairs = [(m, n) for m in range(-8, 9) for n in range(-8, 9) if m or n]
         self._lost_um = np.array([m * x + n * y for m, n in pairs])
+
+    def require_telling(self) -> None:
+        """Raise ValueError if even a mirror that stood still might have lost an order since the reference."""
+        if self.sure(np.zeros(surface.PARAMETERS), math.inf):
+            return
+        tilt_um, odd_um = np.hypot(self._lost_um[:, 0], self._lost_um[:, 1]), self.odd_um(self._lost_um)
+        least = int(np.argmin(odd_um**2 + (tilt_um / 150.0) ** 2))
+        raise ValueError(
+            f"a lost period looks like a tilt of {tilt_um[least]:.0f} um RMS with {odd_um[least]:.1f} um of "
+            "other terms, as if the mirror had moved: use a longer period"
+        )
 
     def odd_um(self, change_um: FloatArray) -> FloatArray:
         """RMS of a change (..., 36) without its tilt and without its bowl."""

@@ -49,6 +49,8 @@ class Tracker:
         Noise of a pixel.
     displacement_um : float
         Laser reading of the reference; NaN without.
+
+    Raises ValueError if no frame could tell a lost period from a film that moved.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Tracker:
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
         self._anchor_light = math.nan
         self._orders = tracked.LostOrders(self._fitter)
+        self._orders.require_telling()
         self._knocked = ""
         self._mean_place: tuple[float, FloatArray] | None = None  # its time, parameters: of the last five steps
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
@@ -237,6 +240,8 @@ class Tracker:
         rest, far = self._scale_of(fit) / swing_adu, np.abs(fit.residual_adu) > _FAR_OFF * swing_adu
         out = float(np.mean((far & (fit.weights == 0))[~saturated & ~self._squares.bins(covered)]))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
+        if doubt is not None and doubt.lost and self._lost(fit):
+            doubt = self._blinded(seen, float(np.mean(covered))) or doubt
         if doubt is not None and doubt.verdict == "rejected":
             return tracked.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, shifts_rad, time_s, displacement_um)
@@ -311,6 +316,15 @@ class Tracker:
 
     def _lost(self, fit: FrameFit) -> bool:
         return not fit.converged or self._scale_of(fit) > _REST_REJECTED * self._swing_adu
+
+    def _blinded(self, seen: Singles, covered: float) -> Finding | None:
+        """Why a frame has no fit, if it is not that the mirror moved."""
+        contrast = self._squares.contrast(seen)
+        if contrast < _CONTRAST:
+            return Finding("rejected", f"no fringes: {contrast:.0%} of the reference's contrast")
+        if covered > tracked.COVERED_DEGRADED:
+            return Finding("rejected", f"covered: without {covered:.0%} of the mirror there is no fit")
+        return None
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
