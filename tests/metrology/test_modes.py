@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.track import live
-from membrane_ctrl.metrology.track.live import Stethoscope
+from membrane_ctrl.metrology.track.live import Heard, Stethoscope
 from membrane_ctrl.metrology.track.modes import VibrationMode, find_modes
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, sentence
 from membrane_ctrl.model.run_events import Vibrations, from_dict
@@ -50,6 +50,27 @@ def test_terms_of_less_noise_than_a_nanometre_make_no_others(seed: int) -> None:
     assert found is not None
     assert sorted(line.frequency_hz for line in found) == pytest.approx([27, 48, 57, 61], abs=0.01)
     assert len(found) == len(planted)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_the_slow_motion_of_a_held_film_makes_no_lines(seed: int) -> None:
+    """It is nearly all in one term, 28 nm/rtHz at 1 Hz, and at one of the rates among a mode's aliases."""
+    time_s, coeffs_um, planted = watched(
+        seed, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, noise_nm=3.0, drift_nm=0.0, drums=True
+    )
+    each_hz = np.linspace(0.05, 8.0, 400)
+    turns = np.outer(time_s - time_s[0], 2 * math.pi * each_hz) + np.random.default_rng(seed).uniform(
+        0, 2 * math.pi, 400
+    )
+    bowl_nm = np.cos(turns) @ (28.0 * math.sqrt(2 * (each_hz[1] - each_hz[0])) / each_hz)
+    coeffs_um[:, [0, 3]] += 1e-3 * bowl_nm[:, None] * [math.sqrt(3), 1.0]  # the vertex stays at 0
+    found = find_modes(time_s, np.round(coeffs_um, 3))
+    assert found is not None
+    sure = [line for line in found if not line.aliases_hz]
+    assert sorted(line.frequency_hz for line in sure) == pytest.approx([27, 48, 57, 61], abs=0.02)
+    for mode in planted:
+        (seen,) = mode.seen_by(tuple(sure))
+        assert seen.amplitude_nm == pytest.approx(20.0, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", [307, 312])
@@ -147,50 +168,120 @@ def test_a_damped_mode_has_the_error_of_its_width() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(near))) < 1.6
 
 
-FRAMES = np.arange(0.0, 60.0, 0.05), np.zeros((1200, 36))
+DAY_S = 86400.0
 SHAPES = np.eye(36)
+USUAL = {3: 48.0, 7: 61.0}
+Searches = list[dict[int, float]]
 
 
 def heard(
-    monkeypatch: pytest.MonkeyPatch, minutes: list[dict[int, float]], stroke_hz: float = 0.0
+    monkeypatch: pytest.MonkeyPatch, listener: Stethoscope, lines: Searches, day: float = 0.0
 ) -> list[list[Event]]:
-    """What a hold tells in minutes in which modes, by the number of their shape, are at these frequencies."""
-    listener = Stethoscope(stroke_hz)
+    """What a hold tells in minutes, from a day on, in which modes, by the number of their shape, have these lines."""
     told: list[list[Event]] = []
-    for lines in minutes:
-        found = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in lines.items())
-        monkeypatch.setattr(live, "find_modes", lambda *_, found=found: found)
-        told.append(listener.search(*FRAMES))
+    for minute, found in enumerate(lines):
+        modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
+        monkeypatch.setattr(live, "find_modes", lambda *_, modes=modes: modes)
+        told.append(listener.search(day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05), np.zeros((1200, 36))))
     return told
 
 
+def notices(told: list[list[Event]]) -> list[Event]:
+    return [event for minute in told for event in minute if not isinstance(event, Vibrations)]
+
+
+def places(told: list[list[Event]]) -> list[list[float | None]]:
+    return [event.frequency_hz for minute in told for event in minute if isinstance(event, Vibrations)]
+
+
+def scaled(by: float) -> dict[int, float]:
+    return {k: by * hz for k, hz in USUAL.items()}
+
+
 def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = heard(monkeypatch, [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}])
-    lines = [[event.frequency_hz for event in minute if isinstance(event, Vibrations)] for minute in told]
-    assert lines == [[], [[48.0]], [[None]], [[48.1, 27.0]], [[47.0, None]]]
+    told = heard(monkeypatch, Stethoscope(), [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}])
+    assert places(told) == [[48.0], [None], [48.1, 27.0], [47.0, None]]
     assert told[2][0].to_dict()["message"] == "none"
 
 
-def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    def told(minutes: list[dict[int, float]]) -> list[Event]:
-        found = (event for minute in heard(monkeypatch, minutes) for event in minute)
-        return [event for event in found if not isinstance(event, Vibrations)]
+def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hold of a week would be full of them."""
+    passing: Searches = [{3: 48.0, k: 30.0 + 5 * k} for k in range(8, 20)]
+    told = heard(monkeypatch, Stethoscope(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
+    lines = places(told)
+    assert max(len(each) for each in lines) == 6
+    assert all(each[0] == 48.0 for each in lines[-12:])
+    assert [sum(hz is not None for hz in each) for each in lines[-12:]] == [2] * 12
 
-    usual, lower, near = {3: 48.0, 7: 61.0}, {3: 47.3, 7: 61.0}, {3: 48.2, 7: 61.0}
-    assert told(10 * [usual] + 10 * [near]) == []
-    moved, *again = told(6 * [usual] + 2 * [lower] + 6 * [usual] + 6 * [lower] + 6 * [usual])
+
+def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = heard(monkeypatch, Stethoscope(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}])
+    assert places(told) == [[48.0, 48.15], [48.0, 48.15]]
+
+
+def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener, lower = Stethoscope(), {3: 47.3, 7: 61.0}
+    assert notices(heard(monkeypatch, listener, 10 * [USUAL] + 10 * [{3: 48.2, 7: 61.0}])) == []
+    moved, *again = notices(
+        heard(monkeypatch, listener, 2 * [lower] + 6 * [USUAL] + 6 * [lower] + 6 * [USUAL], 20 / 1440)
+    )
     assert isinstance(moved, Maintenance)
     assert moved.name == "film_tension"
-    assert "48.00 Hz moved by -1.5%: the film's tension by -2.9%" in moved.message
+    assert "48.00 Hz moved by -1.5% within 1 h: the film's tension by -2.9%" in moved.message
     assert [type(event) for event in again] == [MaintenanceOver]
 
 
+@pytest.mark.parametrize(("change", "told"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)])
+def test_a_slow_shift_within_a_week_is_told(monkeypatch: pytest.MonkeyPatch, change: float, told: int) -> None:
+    """Five minutes a day; the last on day 7."""
+    listener, said = Stethoscope(), []
+    for day in range(8):
+        said += notices(heard(monkeypatch, listener, 5 * [scaled(1 + change * day / 7)], day))
+    assert [type(event) for event in said] == [Maintenance] * told
+    assert all(
+        f"moved by {change:+.1%} within 168 h: the film's tension by {2 * change:+.1%}" in str(e) for e in said
+    )
+
+
+def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Stethoscope()
+    said = [
+        [event.kind for event in notices(heard(monkeypatch, listener, 6 * [scaled(1.0 if day < 2 else 0.985)], day))]
+        for day in range(12)
+    ]
+    assert said == [[], [], ["maintenance"], *[[]] * 7, ["maintenance_over"], []]
+
+
+def test_a_shift_slower_than_that_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Stethoscope()
+    for day in range(30):
+        assert notices(heard(monkeypatch, listener, 5 * [scaled(1 + 0.007 * day / 7)], day)) == []
+
+
+def test_a_mode_that_was_away_for_a_week_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Stethoscope()
+    heard(monkeypatch, listener, 6 * [USUAL])
+    assert notices(heard(monkeypatch, listener, 12 * [scaled(1.015)], day=9)) == []
+
+
+def test_the_next_listener_goes_on_where_the_last_one_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Stethoscope(61.0, begin_utc_s=0.0)
+    (driven,) = notices(heard(monkeypatch, first, 6 * [USUAL]))
+    same_run = Stethoscope(61.0, begin_utc_s=0.0, known=first.heard)
+    assert driven.name == "pump_resonance"
+    assert notices(heard(monkeypatch, same_run, [USUAL], 0.1)) == []
+    next_run = Stethoscope(0.0, begin_utc_s=2 * DAY_S, known=Heard(first.heard.modes))
+    moved = notices(heard(monkeypatch, next_run, 5 * [scaled(0.99)]))
+    assert [event.name for event in moved] == ["film_tension"]
+    assert "48.00 Hz moved by -1.0% within 48 h" in moved[0].message
+
+
 def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual, away = {3: 48.0, 7: 61.0}, {3: 48.0}
+    away = {3: 48.0}
 
     def told(stroke_hz: float) -> list[Event]:
-        found = (e for minute in heard(monkeypatch, [usual, usual, away, away, usual], stroke_hz) for e in minute)
-        return [event for event in found if not isinstance(event, Vibrations)]
+        minutes = [*5 * [USUAL], *4 * [away], USUAL, *6 * [away], *5 * [USUAL]]
+        return notices(heard(monkeypatch, Stethoscope(stroke_hz), minutes))
 
     assert told(0.0) == told(59.9) == told(52.0) == []
     driven, over, again = told(61.5)
@@ -199,6 +290,10 @@ def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(monkeypat
     assert "strokes, 61.5 Hz, drive the mirror's vibration at 61.00 Hz, 5 nm" in driven.message
     assert isinstance(over, MaintenanceOver)
     assert again == driven
+
+
+def test_a_line_heard_once_at_the_strokes_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert notices(heard(monkeypatch, Stethoscope(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]])) == []
 
 
 @pytest.mark.campaign

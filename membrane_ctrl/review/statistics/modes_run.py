@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 _SEARCHES = 60  # of a run, evenly spread: a quarter of a second each
+_ENDS = 3  # searches, whose median is where a mode was at first, or is at last
 _SHOWN = 6  # modes in the picture
 _USUAL = 0.5  # share of the searches that a mode is in
 _LARGEST_UM = 1e6  # a term of a metre is none
@@ -54,10 +55,13 @@ class SeenMode:
 
     @property
     def moved(self) -> float:
-        """Relative change from the first third of the searches to the last; 0 with fewer than six."""
+        """Relative change from the first searches to the last, three of each; 0 with fewer than six in all.
+
+        More of them, as thirds of all, would hide a third of what moves slowly.
+        """
         values = np.array([line.frequency_hz for line in self.lines])[np.argsort(self.time_s)]
-        third = len(values) // 3
-        return float(np.median(values[-third:]) / np.median(values[:third]) - 1) if third > 1 else 0.0
+        ends = min(_ENDS, len(values) // 3)
+        return float(np.median(values[-ends:]) / np.median(values[:ends]) - 1) if ends > 1 else 0.0
 
     def _weights(self) -> FloatArray:
         return np.array([line.sigma_hz for line in self.lines]) ** -2.0
