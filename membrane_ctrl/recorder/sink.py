@@ -101,15 +101,9 @@ class Recording:
             blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
         stream.send_recording_name(self._run_dir.name)
         stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
-        for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS):
+        for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS, streams.VIBRATIONS):
             stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
-        for block in (
-            streams.band(self._config.limits.band_um),
-            streams.CHANGE,
-            streams.SAG,
-            streams.PUMP,
-            streams.VIBRATIONS,
-        ):
+        for block in (streams.band(self._config.limits.band_um), streams.CHANGE, streams.SAG, streams.PUMP):
             stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
         for block in streams.MARKS:  # the average of the lines in a pixel would be none
             stream.log(block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True)
