@@ -3,7 +3,7 @@
 import signal
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,10 +14,13 @@ from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, 
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
-from membrane_ctrl.metrology.track.live import LiveTracker, Stethoscope
+from membrane_ctrl.metrology.track.live import Heard, LiveTracker, Stethoscope
+from membrane_ctrl.model import files, object_codec, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
+from membrane_ctrl.run_files import run_folder
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
 from membrane_ctrl.sim.plant import Truth
 
@@ -149,7 +152,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
-        drift, heard = cycle.LiveDrift(geometry, config.shape.bin_px), Stethoscope(config.pump.stroke_hz)
+        drift, hear = cycle.LiveDrift(geometry, config.shape.bin_px), listener(config, spec.clock, spec.run_dir)
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
         stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot
@@ -161,7 +164,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
         def publish(estimate: ShapeEstimate) -> None:
             shapes.put(pack_estimate(estimate))
-            for notice in (drift.after(estimate), *heard.after(estimate)):
+            for notice in (drift.after(estimate), *hear(estimate)):
                 if notice is not None:
                     remote.tell(notice)
             if raw is not None:
@@ -175,6 +178,47 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         remote.prepared()
         remote.report("running", "first cycle")
         cycle.keep_cycling(taking, remote, publish, clock, period_s, keep)
+
+
+_HEARD = "vibrations.json"  # in the run's folder
+_HEARD_BYTES_MAX = 1 << 20  # usually 10 kB
+
+
+def listener(config: Config, clock: RunClock, run_dir: Path | None) -> Callable[[ShapeEstimate], list[Event]]:
+    """What takes the figures and tells the mirror's vibrations.
+
+    It goes on where the run's last acquisition ended, or that of the newest earlier run with the same devices in the
+    folder of runs: a film that moved meanwhile is told as well. What it has heard is kept in the run's folder.
+    """
+    known = None if run_dir is None else _heard_before(config, run_dir)
+    stethoscope = Stethoscope(config.pump.stroke_hz, clock.origin_utc.timestamp(), known)
+
+    def hear(estimate: ShapeEstimate) -> list[Event]:
+        told = stethoscope.after(estimate)
+        if told and run_dir is not None:
+            with suppress(OSError):  # a full disk: the recorder says so
+                text = plain_json.dumps_checked(object_codec.encode(stethoscope.heard, {}))
+                files.write_text_atomic(run_dir / _HEARD, text + "\n")
+        return told
+
+    return hear
+
+
+def _heard_before(config: Config, run_dir: Path) -> Heard | None:
+    for path in sorted(run_dir.parent.glob(f"*/{_HEARD}"), reverse=True):
+        run = path.parent
+        if run.name > run_dir.name or _bench_name(run_folder.read_config(run, [])) != _bench_name(config):
+            continue
+        with suppress(OSError, ValueError, RecursionError):  # damaged, or of another version: an older one
+            table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
+            if isinstance(table, dict) and plain_json.take_checksum(table):
+                heard: Heard = object_codec.Decoder((Heard(),), {}).decode(table, Heard)
+                return heard if run == run_dir else replace(heard, said=set())  # those were another run's
+    return None
+
+
+def _bench_name(config: Config) -> str:
+    return "" if config.devices is None else config.devices.name
 
 
 def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
