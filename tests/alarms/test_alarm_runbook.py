@@ -10,11 +10,13 @@ import pytest
 from membrane_ctrl import alarms
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film_health
+from membrane_ctrl.metrology.track import live
 
 RUNBOOK = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
 SOURCES = "".join(path.read_text(encoding="utf-8") for path in Path(*alarms.__path__).glob("*.py"))
 PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES))
 MAINTENANCE = re.findall(r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE)
+VIBRATIONS = re.findall(r'_notice\("(\w+)"', Path(live.__file__).read_text(encoding="utf-8"))
 RULES = [rule.name for rule in Config().alarms.rules]
 CHILDREN = [f"{child}_ended" for child in ("recorder", "acquisition", "screen")]
 
@@ -22,10 +24,11 @@ CHILDREN = [f"{child}_ended" for child in ("recorder", "acquisition", "screen")]
 def test_the_names_are_found() -> None:
     assert {"fault", "link", "latch", "silent", "control_gone", "run_ended"} <= PLAIN
     assert set(MAINTENANCE) == {"leak_growth", "pump_reserve", "too_tight", "creep"}
+    assert set(VIBRATIONS) == {"film_tension", "pump_resonance"}
 
 
 @pytest.mark.parametrize(
-    "name", [*sorted(PLAIN), *(f"maintenance_{name}" for name in MAINTENANCE), *RULES, *CHILDREN]
+    "name", [*sorted(PLAIN), *(f"maintenance_{name}" for name in MAINTENANCE + VIBRATIONS), *RULES, *CHILDREN]
 )
 def test_what_to_do_is_said(name: str) -> None:
     assert re.search(rf"^\|.*`{name}`.*\|.+\|.+\|$", RUNBOOK, re.MULTILINE)
