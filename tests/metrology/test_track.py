@@ -180,7 +180,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     [
         ("frozen", "rejected", "frozen"),
         ("hand", "degraded", "covered"),
-        ("grey hand", "rejected", "covered: without"),
+        ("grey hand", "rejected", "covered or order lost"),
         ("body", "rejected", "covered"),
         ("dark", "rejected", "dark"),
         ("bright", "rejected", "saturated"),

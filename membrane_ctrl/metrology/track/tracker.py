@@ -323,7 +323,8 @@ class Tracker:
         if contrast < _CONTRAST:
             return Finding("rejected", f"no fringes: {contrast:.0%} of the reference's contrast")
         if covered > tracked.COVERED_DEGRADED:
-            return Finding("rejected", f"covered: without {covered:.0%} of the mirror there is no fit")
+            left = f"without {covered:.0%} of the mirror there is no fit"
+            return Finding("rejected", f"covered or order lost: {left}", lost=True)
         return None
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
