@@ -15,8 +15,9 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter
-from membrane_ctrl.metrology.track.scene import scene_of
+from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, _split, stepped
+from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
 from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld, Waves
 from tests.support.tracked_errors import CLEAN, MOVING, SIZE, TrackedErrors, errors_of, rms
@@ -57,24 +58,91 @@ def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
     assert rms(found.sag) < 2.0
 
 
-def test_light_that_wanders_bends_no_figure_where_the_bins_end(tmp_path: Path) -> None:
-    """Parts of fringes are left there, and take such light for shape, unless their weights fade."""
-    CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(tmp_path / "full")  # type: ignore[arg-type]
-    reference = Figures().of(tmp_path / "full")
+@dataclass(frozen=True)
+class Still:
+    """A mirror at rest before a clean screen, and its light."""
+
+    scene: CrossedScene
+    fitter: FrameFitter
+    phases: Array
+    start: FrameFit
+    everything: Array  # the reach with which no bin is an outlier
+
+    def light_adu(self, shift_x: float = 0.0, shift_y: float = 0.0) -> Array:
+        waves = np.cos(self.phases + np.array([[shift_x], [shift_y]]))
+        return np.asarray(self.scene.light_adu[0] + np.sum(self.scene.light_adu[1:] * waves, axis=0))
+
+    def wandering(self, seed: int, rms: float = 0.005) -> Array:
+        """Relative light (n,) that wanders over the screen."""
+        places = self.phases / (2 * math.pi) * SIDE_MM / CROSSED
+        return Waves(rms, 75.0, 60.0, SIDE_MM / 2, seed).at(0.0, *places)
+
+    def sag_off_um(self, fit: FrameFit) -> float:
+        return 1e3 * (fit.surface.sag_mm - self.scene.surface.sag_mm)
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Still:
+    folder = tmp_path_factory.mktemp("still") / "full"
+    CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(folder)  # type: ignore[arg-type]
+    reference = Figures().of(folder)
     scene = scene_of(reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
-    phases, jacobian = scene.phase_rad(scene.surface), FrameFitter(scene).jacobian
-    light = scene.light_adu[0] + np.sum(scene.light_adu[1:] * np.cos(phases), axis=0)
-    none, everything = np.zeros(light.size, np.float32), np.full(light.size, 1e6)
-    still = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)
-    places = phases / (2 * math.pi) * SIDE_MM / CROSSED
-    fields = [Waves(0.005, 75.0, 60.0, SIDE_MM / 2, seed).at(0.0, *places) for seed in range(8)]
+    none = np.zeros(scene.index.size, np.float32)
+    start = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)
+    everything = np.full(scene.index.size, 1e6)
+    return Still(scene, FrameFitter(scene), scene.phase_rad(scene.surface), start, everything)
+
+
+def test_light_that_wanders_bends_no_figure_where_the_bins_end(still: Still) -> None:
+    """Parts of fringes are left there, and take such light for shape, unless their weights fade."""
+    light, fields = still.light_adu(), [still.wandering(seed) for seed in range(8)]
     off_um = []
-    for edge in (np.ones_like(scene.edge), scene.edge):
-        fitter = FrameFitter(replace(scene, edge=edge), jacobian)
-        fits = [fitter.fit((light * (1 + one)).astype(np.float32), (0.0, 0.0), still, everything) for one in fields]
-        off_um.append(rms(np.array([1e3 * (fit.surface.sag_mm - scene.surface.sag_mm) for fit in fits])))
+    for edge in (np.ones_like(still.scene.edge), still.scene.edge):
+        fitter = FrameFitter(replace(still.scene, edge=edge), still.fitter.jacobian)
+        fits = [
+            fitter.fit((light * (1 + one)).astype(np.float32), (0.0, 0.0), still.start, still.everything)
+            for one in fields
+        ]
+        off_um.append(rms(np.array([still.sag_off_um(fit) for fit in fits])))
     assert off_um[0] > 0.015
     assert off_um[1] < 0.3 * off_um[0], off_um
+
+
+def test_steps_in_light_that_wanders_give_their_own_frames_again(still: Still) -> None:
+    """Bins that fit in some steps and not in others kept their former light, which moved all frames of a step."""
+    shifts = [(2 * math.pi * k / 5, 4 * math.pi * k / 5) for k in range(5)]
+    seen = [
+        (still.light_adu(*shown) * (1 + still.wandering(seed, 0.01))).astype(np.float32)
+        for seed, shown in enumerate(shifts)
+    ]
+    fits = []
+    for picture, shown in zip(seen, shifts, strict=True):
+        free = still.fitter.fit(picture, shown, still.start, still.everything)
+        reach = np.full(picture.size, 7 * 1.4826 * np.median(np.abs(free.residual_adu)))
+        fits.append(replace(still.fitter.fit(picture, shown, free, reach), surface=still.scene.surface))
+    renewed, moved_mm, _ = stepped(still.fitter, fits, np.stack(seen), np.array(shifts))
+    assert 0.005 < np.mean((renewed.edge == 0) & (renewed.taper > 0)) < 0.5
+    at = Surface.from_parameters(still.scene.surface.parameters + moved_mm, RADIUS_MM)
+    off_um = []
+    for edge in (renewed.taper, renewed.edge):
+        fitter = FrameFitter(replace(renewed, edge=edge), still.fitter.jacobian)
+        again = [
+            fitter.fit(picture, shown, replace(still.start, surface=at), still.everything)
+            for picture, shown in zip(seen, shifts, strict=True)
+        ]
+        off_um.append(rms(np.array([1e3 * (fit.surface.sag_mm - at.sag_mm) for fit in again])))
+    assert off_um[0] > 0.01
+    assert off_um[1] < 0.2 * off_um[0], off_um
+
+
+def test_phases_of_dust_move_no_surface(still: Still) -> None:
+    random, off_rad = np.random.default_rng(3), np.zeros_like(still.phases)
+    off_rad += random.normal(0.0, 1e-3, off_rad.shape)
+    dusty = random.random(off_rad.shape[1]) < 0.002
+    off_rad[:, dusty] += 0.2
+    moved_mm, _, left_rad = _split(still.fitter, off_rad, still.scene.light_adu[1:] * np.sqrt(still.scene.taper))
+    assert 1e6 * np.linalg.norm(moved_mm) < 5.0  # nm; 55 with the dust
+    assert np.median(left_rad[:, dusty]) == pytest.approx(0.2, abs=0.01)  # the bin has them, and fits again
 
 
 @pytest.mark.campaign

@@ -14,7 +14,7 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracked import Jumps, LostOrders, TrackedFrame
+from membrane_ctrl.metrology.track.tracked import Jumps, LostOrders, TrackedFrame, steadied
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
@@ -107,6 +107,28 @@ def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
     frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))]
     assert [frame.verdict for frame in frames] == ["ok", "ok"]
     assert frames[1].sag_um - frames[0].sag_um == pytest.approx(5.0, abs=0.15)
+
+
+def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
+    """The first parameter drifts, the others only scatter: as their errors do, so that they stay on the drift."""
+    random, step_s = np.random.default_rng(2), 10.0 * np.arange(5)
+    drifted = np.outer(step_s, np.eye(36)[0] * 2e-6)
+    places = drifted + random.normal(0, 2e-5, (5, 36))
+    variance = np.full((5, 36), 1.6e-9)  # twice the scatter: all of it is error
+    found, left = steadied(places, variance, drifted)
+    assert np.ptp(found[:, 0]) == pytest.approx(8e-5)
+    assert np.ptp(found[:, 1]) == 0
+    assert np.allclose(found.mean(axis=0), places.mean(axis=0))
+    assert (left < variance).all()
+    moved, _ = steadied(places, variance / 1e6, 0 * drifted)  # errors that explain nothing: it is motion
+    assert np.allclose(moved, places, atol=1e-7)
+
+
+def test_the_drift_is_that_of_the_mean_place_of_five_steps(bench: Bench) -> None:
+    tracker, place = bench.tracker(), np.arange(36.0)
+    assert not tracker._drift_mm_per_s(60.0, place + 5).any()  # nothing is known yet
+    tracker._mean_place = 10.0, place
+    assert tracker._drift_mm_per_s(60.0, place + 5) == pytest.approx(np.full(36, 0.1))
 
 
 def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
