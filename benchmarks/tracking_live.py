@@ -114,6 +114,7 @@ def _measured(screen: Panel) -> list[Figure]:
         cycle.want_full()
         for _ in range(30):  # the anchor, its five steps, and what is compiled
             assert isinstance(cycle.take(), CycleDone)
+            cycle.prepare()
         verdicts, late_ms, due_s = [], [], clock.now()
         begin_s, busy_s = clock.now(), time.process_time()
         for _ in range(FRAMES):
@@ -123,6 +124,7 @@ def _measured(screen: Panel) -> list[Figure]:
             assert isinstance(one, CycleDone)
             verdicts.append(one.estimate.verdict)
             late_ms.append(1e3 * (clock.now() - one.estimate.time_s) - EXPOSURE_MS / 2)
+            cycle.prepare()
         passed_s, busy_s = clock.now() - begin_s, time.process_time() - busy_s
         lost = camera.counts.incomplete + camera.counts.missing
     good = verdicts.count("ok")
