@@ -76,8 +76,7 @@ class Tracker:
         self._knocked = ""
         self._mean_place: tuple[float, FloatArray] | None = None  # its time, parameters: of the last five steps
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
-        self._covariance_um2, self._covariance_s = np.full((36, 36), math.nan), -math.inf
-        self._sag_sigma_um = math.nan
+        self._fit_mm2, self._covariance_s = np.full((surface.PARAMETERS,) * 2, math.nan), -math.inf
         self._prepared_rad = (math.nan, math.nan)
         self._left, self._count = np.zeros(scene.index.size), 0
 
@@ -375,15 +374,17 @@ class Tracker:
     ) -> TrackedFrame:
         if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
-        if self._errors_due is not None and math.isnan(self._sag_sigma_um):
+        if self._errors_due is not None and np.isnan(self._fit_mm2).any():
             self._estimate_errors(*self._errors_due)
+        covariance_mm2 = self._fit_mm2 + np.diag(self._place_mm2(shifts_rad) + self._jumps.variance_mm2())
+        to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
             time_s=time_s,
             coeffs_um=1e3 * fit.surface.coeffs_mm,
-            covariance_um2=self._covariance_um2,
+            covariance_um2=1e6 * to_coeffs @ covariance_mm2 @ to_coeffs.T,
             hencky_um=1e3 * fit.surface.hencky_mm,
             sag_um=1e3 * fit.surface.sag_mm,
-            sag_sigma_um=self._sag_sigma_um,
+            sag_sigma_um=1e3 * math.sqrt(gradient @ covariance_mm2 @ gradient),
             verdict=fault.verdict,
             reason=fault.reason,
             rest_share=rest,
@@ -393,14 +394,7 @@ class Tracker:
         )
 
     def _estimate_errors(self, fit: FrameFit, shifts_rad: tuple[float, float]) -> None:
-        """Covariance of the coefficients and sigma of the sag, smoothed over the estimates."""
+        """Covariance of a fit's parameters, smoothed over the estimates."""
         self._errors_due = None
-        common_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2()
-        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu) + np.diag(common_mm2)
-        to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
-        covariance = 1e6 * to_coeffs @ found @ to_coeffs.T
-        sag_sigma_um = 1e3 * math.sqrt(gradient @ found @ gradient)
-        if np.isfinite(self._covariance_um2).all():
-            covariance = 0.7 * self._covariance_um2 + 0.3 * covariance
-            sag_sigma_um = math.sqrt(0.7 * self._sag_sigma_um**2 + 0.3 * sag_sigma_um**2)
-        self._covariance_um2, self._sag_sigma_um = covariance, sag_sigma_um
+        found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu)
+        self._fit_mm2 = 0.7 * self._fit_mm2 + 0.3 * found if np.isfinite(self._fit_mm2).all() else found
