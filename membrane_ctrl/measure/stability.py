@@ -1,16 +1,241 @@
 """The `stability` command: the paper's stability analysis over a run of many sets, one set in memory at a time."""
 
+import contextlib
+import csv
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
 
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.measure import capture_set, measurement, results, stability_run
-from membrane_ctrl.metrology.uncertainty.stability import default_points_mm
+from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.measure import capture_set, measurement, results, stability_results
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, parameter_to_coeffs
+from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
 from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model.arrays import FloatArray
+
+SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
+_NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
+_PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mean_um", "rmse_max_um")
+
+
+class StabilityRun:
+    """Statistics over the sets of a run.
+
+    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the
+    tracked points; `geometry` is the file of the sets' geometry, with its covariance.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        points_mm: Mapping[str, tuple[float, float]],
+        trials: int,
+        seed: int,
+        geometry: Path | None = None,
+    ) -> None:
+        self._out = out
+        self._points_mm = dict(points_mm)
+        self._trials, self._seed, self._geometry = trials, seed, geometry
+        self._open = contextlib.ExitStack()
+        self._series = self._table(SERIES, stability_results.series_head(points_mm))
+        self._pair_rows = self._table("pairs.csv", _PAIR_HEAD)
+        self._grid: monte_carlo.HeightMap | None = None
+        self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
+        self._spread: geometry_spread.GeometrySpread | None = None
+        self._source = ""
+        self._origin: dict[str, str | None] = {}
+        self._parameters = stability.RunningCovariance(PARAMETERS)
+        self._heights = {name: stability.Tally() for name in points_mm}
+        self._rmse, self._time = stability.Tally(), stability.Tally()
+        self._finder = stability.PairFinder()
+        self._pairs = {lag: (stability.Tally(), stability.Tally()) for lag in stability.LAGS_S}  # change, RMSE
+        self._shown: dict[float, stability.FigurePair] = {}
+        self._bad: list[dict[str, str]] = []
+        self._bad_count = 0
+        self.degraded = 0
+
+    def __enter__(self) -> "StabilityRun":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    def _table(self, name: str, head: Sequence[str]) -> Any:
+        rows = csv.writer(self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n")
+        rows.writerow(head)
+        return rows
+
+    @property
+    def used(self) -> int:
+        """Number of sets with a figure."""
+        return self._parameters.count
+
+    @property
+    def first_reason(self) -> str:
+        """Reason of the first bad set."""
+        return self._bad[0]["reason"] if self._bad else ""
+
+    def skip(self, name: str, reason: str) -> None:
+        """Count a bad set."""
+        self._bad_count += 1
+        if len(self._bad) < _NAMED_BAD:
+            self._bad.append({"set": name, "reason": reason})
+        self._series.writerow((name, "rejected", reason))
+
+    def add(self, name: str, number: int, one: measurement.SetFigure) -> None:
+        """Count a set; `number` is its place in the run, which seeds its noise."""
+        grid, spread = self._grid_for(one), self._spread_for(one)
+        surface = one.figure.fit.surface
+        parameters = surface.parameters
+        bench = one.bench()
+        try:
+            trials = monte_carlo.run_trials([bench], spread, self._seed, range(self._trials), number)[:, 0]
+        except ArithmeticError as error:
+            raise errors.InputError(f"{one.head.folder}: uncertainty: {error}") from None
+        rmse_um = float(1e3 * grid.sigma(monte_carlo.trial_covariance(trials)).mean())
+        self._parameters.add(parameters)
+        self.degraded += one.verdict == "degraded"
+        self._rmse.add(rmse_um)
+        if math.isfinite(one.time_s):
+            self._time.add(one.time_s)
+        heights_um: list[float] = (1e3 * self._point_matrix @ parameters).tolist()
+        for tally, height in zip(self._heights.values(), heights_um, strict=True):
+            tally.add(height)
+        numbers = (one.time_s, one.displacement_um, 1e3 * surface.sag_mm, one.figure.quality.residual_urad, rmse_um)
+        cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
+        self._series.writerow((name, one.verdict, one.reason, *cells))
+        for pair in self._finder.add(stability.Moment(name, one.time_s, parameters, trials)):
+            self._add_pair(grid, pair)
+
+    def table(self) -> dict[str, Any]:
+        """The content of `stability.json`, less its head."""
+        sd_um = self._sd_um()
+        to_coeffs = parameter_to_coeffs()
+        covariance = to_coeffs @ self._parameters.covariance @ to_coeffs.T
+        return {
+            "sets": {
+                "found": self.used + self._bad_count,
+                "used": self.used,
+                "degraded": self.degraded,
+                "bad": self._bad_count,
+                "bad_sets": self._bad,
+            },
+            "duration_s": self._time.high - self._time.low if self._time.count else None,
+            "sd_um": {"mean": float(sd_um.mean()), "max": float(sd_um.max())},
+            "points": self._point_table(),
+            "pairs": [self._pair_table(lag) for lag in stability.LAGS_S],
+            "rmse_um": {"mean": self._rmse.mean, "min": self._rmse.low, "max": self._rmse.high},
+            "zernike": {
+                "index": "noll",
+                "first": 1,
+                "mean_um": (1e3 * to_coeffs @ self._parameters.mean).tolist(),
+                "sd_um": (1e3 * np.sqrt(np.diag(covariance))).tolist(),
+            },
+            "trials": self._trials,
+            "seed": self._seed,
+            "geometry": self._origin
+            | {
+                "names": list(self._spread.names) if self._spread else [],
+                "sigmas": self._spread.sigmas.tolist() if self._spread else [],
+                "source": self._source,
+            },
+        }
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        return stability_results.lines_of(self.table())
+
+    def draw(self) -> list[Path]:
+        """Write the SD map and the pictures and return the latter; the series must be closed. Raises OSError."""
+        grid = self._grid
+        if grid is None:
+            return []
+        axis, sd = grid.axis_mm, grid.picture(self._sd_um())
+        results.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
+        times, heights, coeffs = self._followed()
+        drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
+        stability_results.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
+        stability_results.draw_zernike(drawn[1], times, coeffs)
+        if not self._shown:
+            return drawn[:2]
+        maps = {
+            lag: (grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance)))
+            for lag, pair in self._shown.items()
+        }
+        stability_results.draw_pairs(drawn[2], axis, maps)
+        return drawn
+
+    def record(self, pictures: list[Path]) -> None:
+        """Write `stability.rrd`; the series must be closed. Raises OSError."""
+        if self._grid is None:
+            return
+        sd_um = self._grid.picture(self._sd_um())
+        followed = (list(self._points_mm), *self._followed())
+        stability_results.log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
+
+    def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times, point heights and terms of the sets with a figure."""
+        times, heights, coeffs = stability_results.read_series(self._out / SERIES, len(self._points_mm))
+        if not np.isfinite(times).all():  # sets without times: use their numbers
+            times = np.arange(len(times), dtype=float)
+        return times, heights, coeffs
+
+    def _grid_for(self, one: measurement.SetFigure) -> monte_carlo.HeightMap:
+        if self._grid is None:
+            mirror = one.head.optics.mirror
+            self._grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+            x, y = np.array(list(self._points_mm.values())).T
+            self._point_matrix = monte_carlo.height_matrix(x, y, mirror.radius_mm)
+        return self._grid
+
+    def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
+        if self._spread is None:
+            self._spread, self._source = spread_of(one.head.optics, self._geometry)
+            self._origin = one.head.geometry.table()
+        return self._spread
+
+    def _sd_um(self) -> FloatArray:
+        """Standard deviations (points,) over the sets, at the grid points."""
+        if self._grid is None:
+            return np.zeros(1)
+        return 1e3 * self._grid.sigma(self._parameters.covariance)
+
+    def _add_pair(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> None:
+        rmse_um = 1e3 * grid.sigma(pair.covariance)
+        change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
+        for tally, value in zip(self._pairs[pair.lag_s], (change_um, float(rmse_um.mean())), strict=True):
+            tally.add(value)
+        self._shown.setdefault(pair.lag_s, pair)
+        seconds = pair.later.time_s - pair.earlier.time_s
+        numbers = (seconds, change_um, float(rmse_um.mean()), float(rmse_um.max()))
+        cells = [f"{value:.6g}" for value in numbers]
+        self._pair_rows.writerow((f"{pair.lag_s:g}", pair.earlier.name, pair.later.name, *cells))
+
+    def _point_table(self) -> dict[str, dict[str, float]]:
+        table = {}
+        for row, (name, (x, y)) in zip(self._point_matrix, self._points_mm.items(), strict=True):
+            tally = self._heights[name]
+            sd_um = 1e3 * math.sqrt(row @ self._parameters.covariance @ row)
+            moved = {"mean_um": tally.mean, "sd_um": sd_um, "peak_to_peak_um": tally.high - tally.low}
+            table[name] = {"x_mm": x, "y_mm": y} | moved
+        return table
+
+    def _pair_table(self, lag_s: float) -> dict[str, Any]:
+        change, rmse = self._pairs[lag_s]
+        return {"lag_s": lag_s, "count": change.count} | {
+            name: {"mean": tally.mean, "min": tally.low, "max": tally.high} if tally.count else None
+            for name, tally in (("change_rms_um", change), ("rmse_um", rmse))
+        }
 
 
 @dataclass(frozen=True)
@@ -36,7 +261,7 @@ def stability_command(options: StabilityOptions) -> int:
     points = points_mm(options.points, analysis_radius_mm)
     with errors.writing(out):
         files.make_folder(out)
-        with stability_run.StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
+        with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse(folders, figures, run)
         if run.used == 0:
             raise errors.RejectedError(
@@ -59,7 +284,7 @@ def set_folders(run: Path, out: Path) -> list[Path]:
     if (run / "capture.toml").is_file():
         raise errors.InputError(f"{run}: is itself a capture set; name the folder above it")
     found = sorted(path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve())
-    folders = [path for path in found if not (path / stability_run.SERIES).is_file()]
+    folders = [path for path in found if not (path / SERIES).is_file()]
     if not folders:
         raise errors.InputError(f"{run}: holds no capture sets")
     return folders
@@ -106,10 +331,10 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
             within = f"within {analysis_radius_mm:g} mm of the vertex"
             raise errors.InputError(f"--point {text}: needs a name and a place {within}")
         points[name] = (x, y)
-    return points or default_points_mm(analysis_radius_mm)
+    return points or stability.default_points_mm(analysis_radius_mm)
 
 
-def _analyse(folders: list[Path], figures: measurement.Figures, run: stability_run.StabilityRun) -> None:
+def _analyse(folders: list[Path], figures: measurement.Figures, run: StabilityRun) -> None:
     """Analyse the sets one after the other, with a bar on a terminal; name and skip bad ones."""
     for number, folder in enumerate(terminal.counted(folders, "sets")):
         try:

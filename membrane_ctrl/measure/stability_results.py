@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -143,3 +144,27 @@ def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
     drawn = [rrb.Spatial2DView(origin=f"stability/pictures/{file.stem}", name=file.stem) for file in pictures]
     columns = (rrb.Vertical(*plots), rrb.Vertical(*maps), rrb.Tabs(*drawn))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)
+
+
+def lines_of(table: Mapping[str, Any]) -> list[str]:
+    """The table of `stability.json` as lines of text."""
+    sets, sd_um, rmse_um = table["sets"], table["sd_um"], table["rmse_um"]
+    out = [
+        f"sets      {sets['used']} of {sets['found']} used, {sets['degraded']} degraded, {sets['bad']} bad",
+        f"SD        mean {sd_um['mean']:.4g} um, largest {sd_um['max']:.4g} um",
+    ]
+    out += [
+        f"point {name:3s} ({p['x_mm']:.0f}, {p['y_mm']:.0f}) mm: SD {p['sd_um']:.4g} um, "
+        f"peak to peak {p['peak_to_peak_um']:.4g} um"
+        for name, p in table["points"].items()
+    ]
+    out += [_pair_line(pair) for pair in table["pairs"]]
+    return [*out, f"height    RMSE {rmse_um['mean']:.4g} um, shared by all sets ({table['geometry']['source']})"]
+
+
+def _pair_line(pair: dict[str, Any]) -> str:
+    lag = f"{pair['lag_s'] / 60:g} min"
+    if not pair["count"]:
+        return f"{lag:9s} no pairs"
+    change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
+    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} um RMS, RMSE {rmse:.4g} um on average"
