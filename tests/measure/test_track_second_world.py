@@ -16,6 +16,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.track.bands import Bands
 from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, _split, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
@@ -90,7 +91,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Still:
     none = np.zeros(scene.index.size, np.float32)
     start = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)
     everything = np.full(scene.index.size, 1e6)
-    return Still(scene, FrameFitter(scene), scene.phase_rad(scene.surface), start, everything)
+    return Still(scene, FrameFitter(scene, Bands(scene.row)), scene.phase_rad(scene.surface), start, everything)
 
 
 def test_light_that_wanders_bends_no_figure_where_the_bins_end(still: Still) -> None:
@@ -98,7 +99,7 @@ def test_light_that_wanders_bends_no_figure_where_the_bins_end(still: Still) -> 
     light, fields = still.light_adu(), [still.wandering(seed) for seed in range(8)]
     off_um = []
     for edge in (np.ones_like(still.scene.edge), still.scene.edge):
-        fitter = FrameFitter(replace(still.scene, edge=edge), still.fitter.jacobian)
+        fitter = FrameFitter(replace(still.scene, edge=edge), still.fitter.bands, still.fitter.jacobian)
         fits = [
             fitter.fit((light * (1 + one)).astype(np.float32), (0.0, 0.0), still.start, still.everything)
             for one in fields
@@ -125,7 +126,7 @@ def test_steps_in_light_that_wanders_give_their_own_frames_again(still: Still) -
     at = Surface.from_parameters(still.scene.surface.parameters + moved_mm, RADIUS_MM)
     off_um = []
     for edge in (renewed.taper, renewed.edge):
-        fitter = FrameFitter(replace(renewed, edge=edge), still.fitter.jacobian)
+        fitter = FrameFitter(replace(renewed, edge=edge), still.fitter.bands, still.fitter.jacobian)
         again = [
             fitter.fit(picture, shown, replace(still.start, surface=at), still.everything)
             for picture, shown in zip(seen, shifts, strict=True)
@@ -133,6 +134,48 @@ def test_steps_in_light_that_wanders_give_their_own_frames_again(still: Still) -
         off_um.append(rms(np.array([1e3 * (fit.surface.sag_mm - at.sag_mm) for fit in again])))
     assert off_um[0] > 0.01
     assert off_um[1] < 0.2 * off_um[0], off_um
+
+
+@pytest.mark.parametrize("bands", [32.0, 19.3])
+def test_bands_of_a_rolling_shutter_are_no_shape(still: Still, bands: float) -> None:
+    """Where they were as wide as the fringes, the sag of an `ok` figure was off by micrometres."""
+    random, known = np.random.default_rng(5), Bands(still.scene.row)
+    fitter = FrameFitter(still.scene, known, still.fitter.jacobian)
+    turns = still.scene.row / (still.scene.row.max() + 1) * 2 * math.pi
+    off_um = []
+    for _ in range(12):
+        phase = random.uniform(0, 2 * math.pi)
+        pulses = 0.01 * np.cos(bands * turns + phase) + 0.003 * np.cos(2 * bands * turns + 2 * phase)
+        noise = random.normal(0.0, 0.05, turns.size)
+        seen = (still.light_adu() * (1 + pulses) + noise).astype(np.float32)
+        blind = still.fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
+        fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
+        while known.search(fitter.rows()):
+            fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
+        known.refine(fitter.rows(), fit.bands)
+        assert fit.converged
+        off_um.append([still.sag_off_um(blind), still.sag_off_um(fit)])
+    without, found = (rms(np.array(one[4:])) for one in zip(*off_um, strict=True))
+    assert len(known.waves) == 4
+    assert found < 0.005
+    assert without > 5 * found, (without, found)
+
+
+def test_bands_that_are_none_move_no_figure(still: Still) -> None:
+    """Light that wanders has few waves along the rows that look like wide bands, and noise has none."""
+    random = np.random.default_rng(6)
+    for seed in range(8):
+        known = Bands(still.scene.row)
+        fitter = FrameFitter(still.scene, known, still.fitter.jacobian)
+        noise = random.normal(0.0, 0.05, still.scene.index.size).astype(np.float32)
+        fitter.fit(still.light_adu().astype(np.float32) + noise, (0.0, 0.0), still.start, still.everything)
+        assert not known.search(fitter.rows())
+        seen = (still.light_adu() * (1 + still.wandering(seed)) + noise).astype(np.float32)
+        without = fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
+        while known.search(fitter.rows()):
+            fit = fitter.fit(seen, (0.0, 0.0), still.start, still.everything)
+        assert len(known.waves) <= 4
+        assert abs(still.sag_off_um(fit) - still.sag_off_um(without)) < 0.001
 
 
 def test_phases_of_dust_move_no_surface(still: Still) -> None:

@@ -13,30 +13,29 @@ A, z_x, z_y of a bin; l and b are the maps that the fits found. The angles of z 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from membrane_ctrl.metrology.optics import kernels
-from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
-from membrane_ctrl.metrology.track.scene import CrossedScene
+from membrane_ctrl.metrology.track.bands import Bands
+from membrane_ctrl.metrology.track.scene import CrossedScene, light_left, light_waves
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
 
-TOLERANCE_MM = 1e-6  # last change of height: 1 nm, of which the next step would leave a tenth
+TOLERANCE_MM = 3e-6  # last change of height at the rim, of which a seventh is left: 0.4 nm there, 0.04 of the terms
 _MAX_STEPS = 10
 _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
 # Largest last change of a frame that is not lost: at the rim, where it is ten times that of the terms. Steps shrink
 # slowly where the weights of many bins change with them.
 _SETTLED_MM = 1e-5
+_ALL_ADU = 1e6  # a reach beyond which no bin is
 _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
 _LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivatives: nanometres off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
-# Share of the reach within which weights are 1. Where they fall from the start, as Tukey's do, they differ between
-# bright and dark fringes as soon as light wanders, and bend the figure: 20 nm of sag at 0.5 %.
-_TRUSTED = 0.6
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
 _BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
@@ -45,56 +44,6 @@ _STRAY_SIGMAS = 8.0  # robust ones; phases beyond it are those of dust, and move
 # Mean weights of a bin in a step: one that fits now and fails then has changed, and has no weight until five steps
 # agree. With its former light it moved the frames of each step by up to 30 nm of sag.
 _FITS, _FAILS = 0.95, 0.05
-
-
-@kernel
-def _model(base, turn, shifts, light, maps, cell, offset, response, edge, seen, reach, pull, out):  # type: ignore[no-untyped-def]
-    """Residual r and weight w of n bins in `out` (2, n), and of their N cells in `pull` (5, 3, N) moments of
-    e w r times dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y.
-
-    `light` (3, n) are A, B_x, B_y, `turn` (2, 3, N) and `maps` (3, 3, N) the planes of changes of phases and light,
-    `cell` (n,) and `offset` (2, n) the place of a bin, `edge` (n,) is e, `reach` (n,) is where w ends; 0 leaves out.
-    """
-    pull[:] = 0
-    bent = response[0] != 0 or response[1] != 0 or response[2] != 0 or response[3] != 0
-    for p in range(seen.size):
-        q, u, v = cell[p], offset[0, p], offset[1, p]
-        x = base[0, p] + turn[0, 0, q] + turn[0, 1, q] * u + turn[0, 2, q] * v + shifts[0]
-        y = base[1, p] + turn[1, 0, q] + turn[1, 1, q] * u + turn[1, 2, q] * v + shifts[1]
-        level = light[0, p] * (maps[0, 0, q] + maps[0, 1, q] * u + maps[0, 2, q] * v)
-        steep_x = light[1, p] * (maps[1, 0, q] + maps[1, 1, q] * u + maps[1, 2, q] * v)
-        steep_y = light[2, p] * (maps[2, 0, q] + maps[2, 1, q] * u + maps[2, 2, q] * v)
-        cx, sx, cy, sy = math.cos(x), math.sin(x), math.cos(y), math.sin(y)
-        twice, shown = 0.0, level + steep_x * cx + steep_y * cy
-        if bent:
-            shade = 0.5 + 0.25 * (cx + cy)
-            most = 2 * (steep_x + steep_y)
-            power, slope, h = shade, 0.0, 0.0
-            for k in range(4):
-                slope += response[k] * ((k + 2) * power - 1)
-                power *= shade
-                h += response[k] * (power - shade)
-            shown += most * h
-            twice = 2 * h
-            steep_x += most * slope / 4
-            steep_y += most * slope / 4
-        r = seen[p] - shown
-        far = max(abs(r) / reach[p] - _TRUSTED, 0.0) / (1 - _TRUSTED) if reach[p] > 0 else 1.0
-        w = (1 - far * far) * (1 - far * far) if far < 1 else 0.0
-        weighed = w * r * edge[p]
-        pulls = (
-            -weighed * steep_x * sx,
-            -weighed * steep_y * sy,
-            weighed * light[0, p],
-            weighed * light[1, p] * (cx + twice),
-            weighed * light[2, p] * (cy + twice),
-        )
-        for k in range(5):
-            pull[k, 0, q] += pulls[k]
-            pull[k, 1, q] += pulls[k] * u
-            pull[k, 2, q] += pulls[k] * v
-        out[0, p] = r
-        out[1, p] = w
 
 
 @dataclass(frozen=True)
@@ -106,6 +55,14 @@ class FrameFit:
     residual_adu: Singles  # (n,): light less the model's
     weights: Singles  # (n,): 1, falling to 0 for outliers
     converged: bool
+    bands: FloatArray = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (2 k,): relative amplitudes of the waves along the rows
+
+    @cached_property
+    def scale_adu(self) -> float:
+        """Robust sigma of the residual."""
+        return 1.4826 * float(np.median(np.abs(self.residual_adu[::3])))
 
 
 class FrameFitter:
@@ -115,12 +72,14 @@ class FrameFitter:
     ----------
     scene : CrossedScene
         What a frame must show.
+    bands : Bands
+        Of the rows.
     jacobian : (2, 36, 3, N) array, optional
         That of a fitter of another scene with the same bins and surface; made anew if not given.
     """
 
-    def __init__(self, scene: CrossedScene, jacobian: Singles | None = None) -> None:
-        self.scene = scene
+    def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
+        self.scene, self.bands = scene, bands
         self._cells = scene.cells
         self.jacobian = self._cells.planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
         self._basis = self._cells.planes(scene.basis)
@@ -128,9 +87,10 @@ class FrameFitter:
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
-        self._out = np.empty((2, scene.index.size), np.float32)
+        self._out = np.empty((4, scene.index.size), np.float32)
         self._pull = np.empty((5, *self._basis.shape[1:]), np.float32)
         self._maps = np.empty_like(self._pull[:3])
+        self._response = scene.response.astype(np.float32)
 
     def fit(
         self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
@@ -146,6 +106,8 @@ class FrameFitter:
         reach_adu : (n,) array
             Residual from which a bin has no weight; 0 leaves it out.
         """
+        if self._inverse is not None and len(self._inverse) != _UNKNOWNS + len(self.bands.waves):
+            self._inverse = None
         inherited = self._inverse is not None
         found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=False)
         if not found.converged and inherited:  # perhaps the matrix is of another frame
@@ -164,8 +126,12 @@ class FrameFitter:
     ) -> FrameFit:
         """Take steps until they vanish, lead astray or need too many matrices; small steps may if `patient`."""
         shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
+        bands = np.zeros(len(self.bands.waves))
+        if bands.size:  # each frame has others: without them, much would be an outlier at first
+            self._evaluate(seen_adu, shifts_rad, shape, light, bands, np.where(reach > 0, _ALL_ADU, 0.0))
+            bands = self.bands.solved(self.rows())
         for _ in range(_MAX_STEPS):
-            self._evaluate(seen_adu, shifts_rad, shape, light, reach)
+            self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
             if self._inverse is None:
                 self._inverse = self._inverted(shifts_rad, shape, light, self._out[1])
                 matrices, change = matrices + 1, math.inf  # its first step is not judged by an old one's last
@@ -173,22 +139,39 @@ class FrameFitter:
                 break
             delta, last = self._inverse @ self._right(), change
             shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
-            light += delta[PARAMETERS:].reshape(3, TERMS)
+            light += delta[PARAMETERS:_UNKNOWNS].reshape(3, TERMS)
+            bands = bands + delta[_UNKNOWNS:]
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
             if not TOLERANCE_MM < change < _ASTRAY_MM:
                 break
             if change > _SLOW * last and (matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)):
                 self._inverse = None
-        residual, weights = self._out.copy()
-        return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM)
+        residual, weights = self._out[:2].copy()
+        return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM, bands)
 
     def _evaluate(
-        self, seen_adu: Singles, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, reach: FloatArray
+        self,
+        seen_adu: Singles,
+        shifts_rad: tuple[float, float],
+        shape: Surface,
+        light: FloatArray,
+        bands: FloatArray,
+        reach: FloatArray,
     ) -> None:
-        """Residual, weights and what the right side is made of, at a surface and maps of light."""
-        turn, shifts = self._turned(shape, light), np.array(shifts_rad, np.float32)
-        fixed = (self._light_adu, self._maps, *self._cells.places, self.scene.response, self.scene.edge)
-        _model(self._base, turn, shifts, *fixed, seen_adu, reach, self._pull, self._out)
+        """Residual, weights and what the right side is made of, at a surface, maps of light and bands."""
+        gain = self.bands.gain(bands)
+        seen = self.scene.edge, gain, seen_adu, reach.astype(np.float32)
+        light_left(*self._shown(shifts_rad, shape, light), *seen, self._pull, self._out)
+
+    def rows(self) -> FloatArray:
+        """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
+        return self.bands.sums(self._out[2:])
+
+    def _shown(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
+        """What the kernels take a frame's light from."""
+        turn, (_, offset) = self._turned(shape, light), self._cells.places
+        turn[:, 0] += np.array(shifts_rad, np.float32)[:, None]
+        return self._base, turn, self._light_adu, self._maps, self._cells.starts, offset, self._response
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
         """Planes (2, 3, N) of a surface's phases beyond those of the one traced last; the maps follow the light."""
@@ -201,41 +184,36 @@ class FrameFitter:
         return np.asarray(moved.astype(np.float32) @ _flat(self.jacobian)).reshape(2, 3, -1)
 
     def _right(self) -> FloatArray:
-        """J^T W r (144,) of the last evaluation."""
+        """J^T W r (144 + 2 k,) of the last evaluation."""
         pull = _flat(self._pull)
         of_surface = sum(_flat(slow) @ one for slow, one in zip(self.jacobian, pull[:2], strict=True))
-        return np.concatenate([of_surface, (pull[2:] @ _flat(self._basis).T).ravel()]).astype(float)
+        parts = [of_surface, (pull[2:] @ _flat(self._basis).T).ravel()]
+        if len(self.bands.waves):
+            parts.append(self.bands.waves @ self.rows()[0])
+        return np.concatenate(parts).astype(float)
 
     def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
-        """Rows (5, n): dI by phi_x, by phi_y, and by relative changes of A, B_x, B_y."""
-        turn = self._turned(shape, light)  # may trace anew
-        x, y = self._base + self._cells.spread(turn) + np.reshape(np.array(shifts_rad, np.float32), (2, 1))
-        level, first, second = self._light_adu
-        _, swing_x, swing_y = self._light_adu * self._cells.spread(self._maps)
-        slope, twice = self._bent(x, y)
-        steeper = (swing_x + swing_y) / 2 * slope
-        of_phases = -(swing_x + steeper) * np.sin(x), -(swing_y + steeper) * np.sin(y)
-        return np.stack([*of_phases, level, first * (np.cos(x) + twice), second * (np.cos(y) + twice)])
-
-    def _bent(self, x: Singles, y: Singles) -> tuple[Singles, Singles]:
-        """Slope (n,) of what the panel's response adds to a straight line, and twice its value, as in `_model`."""
-        v = 0.5 + 0.25 * (np.cos(x) + np.cos(y))
-        bent = list(enumerate(self.scene.response, start=2))
-        slope = sum(c * (k * v ** (k - 1) - 1) for k, c in bent)
-        twice = sum(2 * c * (v**k - v) for k, c in bent)
-        return np.asarray(slope, np.float32), np.asarray(twice, np.float32)
+        """Rows (6, n): dI by phi_x, by phi_y, by relative changes of A, B_x, B_y, and of all light."""
+        waves = np.empty((6, self.scene.index.size), np.float32)
+        light_waves(*self._shown(shifts_rad, shape, light), waves)
+        return waves
 
     def _inverted(
         self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, weights: Singles
     ) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
-        waves = self._waves(shifts_rad, shape, light)
+        *waves, shown = self._waves(shifts_rad, shape, light)
         slow = [planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)]  # it need not be exact
-        matrix = np.zeros((_UNKNOWNS, _UNKNOWNS))
+        bands, weights = shown * self.bands.waves[:, self.bands.row], weights * self.scene.edge
+        matrix = np.zeros((_UNKNOWNS + len(bands),) * 2)
         for i, j in product(range(len(slow)), repeat=2):
             rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
-            both = self._cells.sums(waves[i] * waves[j] * weights * self.scene.edge)
+            both = self._cells.sums(waves[i] * waves[j] * weights)
             matrix[rows, columns] += (slow[i] * both) @ slow[j].T
+        for start, planes, wave in zip(_STARTS, slow, waves, strict=True):
+            matrix[start : start + PARAMETERS, _UNKNOWNS:] += planes @ self._cells.sums(bands * wave * weights).T
+        matrix[_UNKNOWNS:, :_UNKNOWNS] = matrix[:_UNKNOWNS, _UNKNOWNS:].T
+        matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
         if not kernels.invert(matrix):
@@ -249,15 +227,19 @@ class FrameFitter:
         counts as one error, and the squares as independent. Maps of light are refitted with the surface, so that
         their errors are in it.
         """
-        if self._inverse is None:  # the last frame was refused
+        if self._inverse is None or len(self._inverse) != _UNKNOWNS + len(self.bands.waves):  # the last was refused
             self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
         if self._inverse is None:
             return np.full((PARAMETERS, PARAMETERS), math.nan)
         gain = self._inverse[:PARAMETERS].astype(np.float32)
         parts = zip(_STARTS, (*self.jacobian, *[self._basis] * 3), strict=True)
         slow = np.stack([np.tensordot(gain[:, at : at + PARAMETERS], planes, 1) for at, planes in parts], axis=1)
-        waves = self._waves(shifts_rad, fit.surface, fit.light)
-        sums = self.in_squares(slow, waves * (self.scene.edge * fit.weights * fit.residual_adu))
+        *waves, shown = self._waves(shifts_rad, fit.surface, fit.light)
+        left = self.scene.edge * fit.weights * fit.residual_adu
+        sums = self.in_squares(slow, np.stack(waves) * left)
+        if len(gain.T) > _UNKNOWNS:  # bands are no planes
+            bands = gain[:, _UNKNOWNS:, None, None] * np.array([1, 0, 0], np.float32)[:, None]
+            sums += self.in_squares(bands, self.bands.waves[:, self.bands.row] * shown * left)
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))

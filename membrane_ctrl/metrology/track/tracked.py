@@ -14,8 +14,15 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
 
 # Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
 _COVERED = 0.25
-_COVERED_REJECTED, COVERED_DEGRADED = 0.25, 0.02
+_COVERED_REJECTED, _COVERED_DEGRADED = 0.25, 0.02
 _GREY = 0.3  # contrast of a square against the median's: less is no fringe but a grey thing before it
+_CONTRAST = 0.4  # of the fringes, against the reference's
+_EXPOSURE = 0.03  # change of light from frame to frame that no panel makes
+_DIMMED = 0.9  # of the light at the anchor
+# What the fit leaves, over the swing of the fringes: noise, light and dust leave hundredths, a lost order 0.7
+REST_REJECTED = 0.15
+_OUT_REJECTED = 0.1  # share of bins without weight and far off
+_LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _UNEVEN = 0.1  # of a square's light: as much of a fringe does not average out in it
 _DARK = 0.3  # of the reference's light
 _STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
@@ -176,9 +183,31 @@ def light_faults(saturated: float, light: float, covered: BoolArray) -> list[Fin
         (light < _DARK, "rejected", f"dark: {light:.0%} of the reference's light"),
         (share > _COVERED_REJECTED, "rejected", f"covered: the light of {share:.0%} of the mirror is wrong"),
         (saturated > degraded, "degraded", f"saturated: {saturated:.1%} of the bins"),
-        (share > COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
+        (share > _COVERED_DEGRADED, "degraded", f"covered: {share:.0%} of the mirror is left out"),
     )
     return [Finding(verdict, reason) for wrong, verdict, reason in checks if wrong]  # type: ignore[arg-type]
+
+
+def light_changes(light: float, last: float, anchor: float) -> list[Finding]:
+    """What the light of a frame says of exposure and panel, beside that of the last and that at the anchor."""
+    if abs(light / last - 1) > _EXPOSURE:
+        return [Finding("degraded", f"exposure changed: {light / last:.2f} of the light of the last frame")]
+    if light < _DIMMED * anchor:
+        return [Finding("degraded", f"the screen dimmed to {light / anchor:.0%} of its light")]
+    return []
+
+
+def fit_fault(fit: FrameFit, rest: float, out: float) -> Finding | None:
+    """Whether a fit has failed: `rest` over the swing of the fringes is left, `out` of the bins have no weight."""
+    if not fit.converged or rest > REST_REJECTED or out > _OUT_REJECTED:
+        left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
+        return Finding("rejected", f"order lost: the mirror moved too far since the last good frame ({left})", True)
+    contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
+    if contrast < -_CONTRAST:
+        return Finding("rejected", "order lost: the fringes moved by half a period", True)
+    if contrast < _CONTRAST:
+        return Finding("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
+    return None
 
 
 class Squares:
@@ -212,9 +241,15 @@ class Squares:
         grey = self._even & (contrast < _GREY * float(np.median(contrast[self._even])))
         return light, self._whole & (wrong | grey)
 
-    def contrast(self, seen: Singles) -> float:
-        """Of the fringes of a frame, whatever their phases, over the scene's."""
-        return float(np.median(self._contrasts(seen)[self._even]))
+    def blinded(self, seen: Singles, covered: float) -> Finding | None:
+        """Why a frame has no fit, if it is not that the mirror moved; `covered` is a share of the squares."""
+        contrast = float(np.median(self._contrasts(seen)[self._even]))
+        if contrast < _CONTRAST:
+            return Finding("rejected", f"no fringes: {contrast:.0%} of the reference's contrast")
+        if covered > _COVERED_DEGRADED:
+            left = f"without {covered:.0%} of the mirror there is no fit"
+            return Finding("rejected", f"covered or order lost: {left}", lost=True)
+        return None
 
     def _contrasts(self, seen: Singles) -> FloatArray:
         share = seen / self._light_adu
@@ -260,6 +295,21 @@ class LostOrders:
         rest[..., :2] = 0.0
         rest -= (rest @ self._bowl)[..., None] * self._bowl
         return np.asarray(np.linalg.norm(rest, axis=-1))
+
+    def doubt(self, change_um: FloatArray, passed_s: float, displacement_um: float) -> Finding | None:
+        """Whether a change (36,) is none of this mirror's; `displacement_um` is that of the laser, NaN without."""
+        if not self.sure(change_um, passed_s):
+            tilt_um, odd_um = np.hypot(*change_um[:2]), self.odd_um(change_um)
+            return Finding(
+                "rejected",
+                "order lost: the mirror moved by a period or more since the last good frame, or changed its shape "
+                f"(tilt {tilt_um:.0f} um RMS, other terms {odd_um:.1f})",
+                lost=True,
+            )
+        sag_um = float(surface.sag_gradient() @ change_um)
+        if abs(sag_um - displacement_um) > _LASER_UM:
+            return Finding("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
+        return None
 
     def sure(self, change_um: FloatArray, passed_s: float) -> bool:
         """Whether a change is that of a film, and would not be with any orders lost."""

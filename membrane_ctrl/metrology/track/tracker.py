@@ -13,23 +13,17 @@ import numpy as np
 from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track import tracked
+from membrane_ctrl.metrology.track.bands import Bands
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 
-_CONTRAST = 0.4  # of the fringes, against the reference's
-_EXPOSURE = 0.03  # change of light from frame to frame that no panel makes
-_DIMMED = 0.9  # of the light at the anchor
-# What the fit leaves, over the swing of the fringes: noise, light and dust leave hundredths, a lost order 0.7
-_REST_REJECTED = 0.15
-_OUT_REJECTED = 0.1  # share of bins without weight and far off, over the swing: dust that moved is no lost order
-_FAR_OFF = 0.05
+_FAR_OFF = 0.05  # over the swing: dust that moved is no lost order
 _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
-_LASER_UM = 20.0  # change of sag from frame to frame, less the laser's
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
 _SIGMA_EVERY_S = 1.25  # errors change slowly, and the covariance costs as much as five fits
 
@@ -63,10 +57,12 @@ class Tracker:
     ) -> None:
         self._binner = Binner(*size_px, scene.bin_px, full_scale_adu, 1)
         self._seen: Singles = np.zeros(scene.index.size, np.float32)
+        self._clear = self._seen  # of the last frame, without bands
         self._scale_adu = 0.0
         self._blind = noise_adu < _BLIND_NOISE_ADU
         self._noise_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
-        self._fitter = FrameFitter(scene)
+        self._bands = Bands(scene.row)
+        self._fitter = FrameFitter(scene, self._bands)
         self._jumps = tracked.Jumps()
         self._begin(scene, scene.surface, np.zeros((3, zernike.TERMS)))
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
@@ -84,7 +80,7 @@ class Tracker:
         """Start from a scene, a surface and maps (3, 36) of light."""
         none, all_bins = np.zeros(scene.index.size, np.float32), np.ones(scene.index.size, np.float32)
         self._swing_adu = float(np.median(scene.light_adu[1]))
-        self._fitter = FrameFitter(scene, self._fitter.jacobian)
+        self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
         self._last = FrameFit(shape, light, none, all_bins, True)
         self._light, self._shown_rad = math.nan, (math.nan, math.nan)
         self._errors_due: tuple[FrameFit, tuple[float, float]] | None = None
@@ -115,7 +111,7 @@ class Tracker:
         for frame, (x, y), at_s, reading in zip(frames, shifts_rad, time_s, displacement_um, strict=True):
             found.append(self.follow(frame, (float(x), float(y)), float(at_s), float(reading)))
             fits.append(self._last)
-            seen.append(self._seen)
+            seen.append(self._clear)
         if any(frame.verdict == "rejected" for frame in found):
             return found
         shown = [(float(x), float(y)) for x, y in shifts_rad]
@@ -230,7 +226,10 @@ class Tracker:
             return tracked.rejected_frame(time_s, "frozen: the frame is identical to the one before")
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
-        faults = [*tracked.light_faults(float(np.mean(saturated)), light, covered), *self._light_changes(light)]
+        faults = [
+            *tracked.light_faults(float(np.mean(saturated)), light, covered),
+            *tracked.light_changes(light, self._light, self._anchor_light),
+        ]
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
             return tracked.rejected_frame(time_s, rejected.reason)
@@ -240,13 +239,13 @@ class Tracker:
         out = float(np.mean((far & (fit.weights == 0))[~saturated & ~self._squares.bins(covered)]))
         doubt = self._doubt(fit, rest, out, time_s, displacement_um)
         if doubt is not None and doubt.lost and self._lost(fit):
-            doubt = self._blinded(seen, float(np.mean(covered))) or doubt
+            doubt = self._squares.blinded(seen, float(np.mean(covered))) or doubt
         if doubt is not None and doubt.verdict == "rejected":
             return tracked.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, shifts_rad, time_s, displacement_um)
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
-            self._remember(shifts_rad, seen, fit, time_s)
+            self._remember(shifts_rad, self._clear, fit, time_s)
         found = self._result(fit, shifts_rad, time_s, worst, rest)
         return replace(found, saturated_share=float(np.mean(saturated)))
 
@@ -255,17 +254,6 @@ class Tracker:
         out = np.full(self._binner.sums.shape[1:], math.nan)
         out.ravel()[self._fitter.scene.index] = self._left / max(self._count, 1)
         return out
-
-    def _light_changes(self, light: float) -> list[Finding]:
-        """What the light says of exposure and panel."""
-        faults = []
-        if abs(light / self._light - 1) > _EXPOSURE:
-            faults.append(
-                Finding("degraded", f"exposure changed: {light / self._light:.2f} of the light of the last frame")
-            )
-        elif light < _DIMMED * self._anchor_light:
-            faults.append(Finding("degraded", f"the screen dimmed to {light / self._anchor_light:.0%} of its light"))
-        return faults
 
     def _fitted(
         self,
@@ -283,6 +271,8 @@ class Tracker:
         maps[:, 0] += brighter - 1  # the first term is 1 everywhere
         start = replace(self._last, light=maps)
         fit = self._robust(seen, shifts_rad, start, left_out)
+        while not self._lost(fit) and self._bands.search(self._fitter.rows()):
+            fit = self._robust(seen, shifts_rad, fit, left_out)
         moved_um = displacement_um - self._last_displacement_um
         if self._lost(fit) and math.isfinite(moved_um):
             bowl = surface.Surface.hencky_bowl(1e-3 * moved_um, fit.surface.radius_mm).parameters
@@ -311,46 +301,22 @@ class Tracker:
 
     def _scale_of(self, fit: FrameFit) -> float:
         """Robust sigma of the residual: the median of its size, unless rounding makes that less than the noise."""
-        return max(1.4826 * float(np.median(np.abs(fit.residual_adu[::3]))), self._noise_adu)
+        return max(fit.scale_adu, self._noise_adu)
 
     def _lost(self, fit: FrameFit) -> bool:
-        return not fit.converged or self._scale_of(fit) > _REST_REJECTED * self._swing_adu
-
-    def _blinded(self, seen: Singles, covered: float) -> Finding | None:
-        """Why a frame has no fit, if it is not that the mirror moved."""
-        contrast = self._squares.contrast(seen)
-        if contrast < _CONTRAST:
-            return Finding("rejected", f"no fringes: {contrast:.0%} of the reference's contrast")
-        if covered > tracked.COVERED_DEGRADED:
-            left = f"without {covered:.0%} of the mirror there is no fit"
-            return Finding("rejected", f"covered or order lost: {left}", lost=True)
-        return None
+        return not fit.converged or self._scale_of(fit) > tracked.REST_REJECTED * self._swing_adu
 
     def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
-        if not fit.converged or rest > _REST_REJECTED or out > _OUT_REJECTED:
-            left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
-            return Finding(
-                "rejected", f"order lost: the mirror moved too far since the last good frame ({left})", True
-            )
-        contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
-        if contrast < -_CONTRAST:
-            return Finding("rejected", "order lost: the fringes moved by half a period", True)
-        if contrast < _CONTRAST:
-            return Finding("rejected", f"no fringes: {abs(contrast):.0%} of the reference's contrast")
+        failed = tracked.fit_fault(fit, rest, out)
+        if failed is not None:
+            return failed
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
-        if not self._orders.sure(change_um, passed_s):
-            return Finding(
-                "rejected",
-                "order lost: the mirror moved by a period or more since the last good frame, or changed its shape "
-                f"(tilt {np.hypot(*change_um[:2]):.0f} um RMS, other terms {self._orders.odd_um(change_um):.1f})",
-                lost=True,
-            )
-        sag_um = float(surface.sag_gradient() @ change_um)
-        if abs(sag_um - (displacement_um - self._last_displacement_um)) > _LASER_UM:
-            return Finding("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
+        strange = self._orders.doubt(change_um, passed_s, displacement_um - self._last_displacement_um)
+        if strange is not None:
+            return strange
         tilt_um = float(np.hypot(*change_um[:2]))
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
@@ -363,6 +329,8 @@ class Tracker:
         self, fit: FrameFit, light: float, shifts_rad: tuple[float, float], time_s: float, displacement_um: float
     ) -> None:
         self._last, self._light, self._shown_rad = fit, light, shifts_rad
+        self._clear = self._seen / self._bands.gain(fit.bands)
+        self._bands.refine(self._fitter.rows(), fit.bands)
         self._last_time_s, self._last_displacement_um = time_s, displacement_um
         self._scale_adu = self._scale_of(fit)
         self._left, self._count = self._left + fit.residual_adu, self._count + 1

@@ -1,0 +1,81 @@
+"""Bands that a pulsed backlight leaves in the rows of a rolling shutter.
+
+Each row sees another part of the pulses, so that the light of a picture is multiplied by waves along its rows. Their
+frequencies stay, their amplitudes and phases are others in each frame. Where bands are as wide as the fringes, a fit
+without them takes them for shape. What it leaves shows them elsewhere: a wave found there joins the fit's unknowns.
+"""
+
+import numpy as np
+from scipy import ndimage
+
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+
+_LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
+# Power over the median around it: bands have 100 and more, what fringes and light leave 20 at most
+_CLEAR = 25.0
+_WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
+_MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
+_FINER = 16  # steps of the frequency in one over the picture's height
+_KEEPS = 0.9  # share of former frames in the mean power, and in what tells a wave's frequency
+
+
+class Bands:
+    """The waves along the rows that frames have shown.
+
+    Parameters
+    ----------
+    row : (n,) array
+        Of each bin.
+    """
+
+    def __init__(self, row: IntArray) -> None:
+        self.row = row
+        self._place = np.arange(int(row.max()) + 1) - row.mean()
+        self._rad_per_row = self._told = np.zeros(0)
+        self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
+        self._power: FloatArray | None = None
+
+    def gain(self, amplitudes: FloatArray) -> Singles:
+        """What multiplies the light of each bin (n,)."""
+        return np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row]
+
+    def sums(self, values: Singles) -> FloatArray:
+        """Over each row (k, R), of values (k, n)."""
+        return np.stack([np.bincount(self.row, one, self._place.size) for one in values])
+
+    def solved(self, rows: FloatArray) -> FloatArray:
+        """Amplitudes (2 k,) from sums (2, R) of light times rest, and of light squared, of a fit without bands."""
+        pull, size = rows
+        return np.asarray(np.linalg.solve((self.waves * size) @ self.waves.T, self.waves @ pull), float)
+
+    def search(self, rows: FloatArray) -> bool:
+        """Whether what fits leave shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
+        size = _FINER * self._place.size
+        power = np.abs(np.fft.rfft(rows[0], size)[: self._place.size // 2 * _FINER]) ** 2
+        power /= max(float(np.mean(power)), 1e-30)
+        self._power = power if self._power is None else _KEEPS * self._power + (1 - _KEEPS) * power
+        around = ndimage.median_filter(self._power.reshape(-1, _FINER).mean(axis=1), 2 * _AROUND + 1)
+        clear = self._power / np.maximum(np.repeat(around, _FINER), 1e-30)
+        clear[: _LEAST_BANDS * _FINER] = 0.0
+        found_rad = 2 * np.pi * int(np.argmax(clear)) / size
+        apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
+        if len(apart) == _MOST or not apart.all() or np.max(clear) < _CLEAR:
+            return False
+        self._power = None
+        self._rad_per_row, self._told = np.append(self._rad_per_row, found_rad), np.append(self._told, 0.0)
+        self._draw()
+        return True
+
+    def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
+        """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""
+        if not amplitudes.size:
+            return
+        (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
+        change = self._place * (across * cosine - along * sine)
+        self._told = _KEEPS * self._told + change**2 @ rows[1]
+        self._rad_per_row = self._rad_per_row + change @ rows[0] / np.maximum(self._told, 1e-30)
+        self._draw()
+
+    def _draw(self) -> None:
+        turns = self._rad_per_row[:, None] * self._place
+        self.waves = np.concatenate([np.cos(turns), np.sin(turns)]).astype(np.float32)
