@@ -139,10 +139,13 @@ def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
         now[:2] = 0.3 * math.sin(0.2 * k), 0.05 * (-1) ** step
         expected.append(jumps.add((float(step), 0.0), now + random.normal(0, 0.001, 36)))
     assert np.flatnonzero(expected).tolist() == [10, 20, 30, 40, 50]
-    sigma = np.sqrt(jumps.variance_mm2())
+    sigma = np.sqrt(jumps.variance_mm2(np.zeros(36)))
     assert sigma[1] == pytest.approx(0.1, rel=0.05)
     assert sigma[0] < 0.01
     assert np.median(sigma) < 0.002
+    known = np.sqrt(jumps.variance_mm2(np.full(36, 0.004**2)))  # of that much the place explains
+    assert known[1] == pytest.approx(0.0998, rel=0.05)
+    assert (known[2:] < sigma[2:].clip(1e-9)).all()
     jumps.begin()  # what was before is no jump
     assert not jumps.add((9.0, 0.0), np.ones(36))
 

@@ -38,7 +38,9 @@ _LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivative
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
-_BLOCKS = 20  # squares along the mirror's diameter whose errors count as independent: 1.6 fringes each
+# Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In smaller ones light that
+# wanders leaves more than it does in all.
+_BLOCKS = 14
 ENOUGH_STEPS = 5  # they separate level, two swings and two phases
 _STRAY_SIGMAS = 8.0  # robust ones; phases beyond it are those of dust, and move no surface
 # Mean weights of a bin in a step: one that fits now and fails then has changed, and has no weight until five steps
@@ -248,7 +250,7 @@ class FrameFitter:
     def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
         """Sums (rows, squares) over squares of the mirror whose errors count as independent.
 
-        `slow` (rows, k, 3, N) are what values (k, n) are multiplied by. Squares of 1.6 fringes fade into their
+        `slow` (rows, k, 3, N) are what values (k, n) are multiplied by. Squares of 2.3 fringes fade into their
         neighbours: what cancels over whole fringes cancels in each. Their sums are as large as those of squares that
         do not overlap.
         """

@@ -140,7 +140,7 @@ class Jumps:
 
     def __init__(self) -> None:
         self._still: deque[FloatArray] = deque(maxlen=50)
-        self._steps: deque[FloatArray] = deque(maxlen=ENOUGH_STEPS)
+        self._steps: deque[FloatArray] = deque(maxlen=5 * ENOUGH_STEPS)  # fewer scatter more than they tell
         self.begin()
 
     def begin(self) -> None:
@@ -157,12 +157,15 @@ class Jumps:
         (self._steps if stepped else self._still).append((now - 2 * last + before) ** 2)
         return stepped
 
-    def variance_mm2(self) -> FloatArray:
-        """Of the parameters (36,); zeros where frames of one step scatter nearly as much."""
+    def variance_mm2(self, place_mm2: FloatArray) -> FloatArray:
+        """Of the parameters (36,), beyond that of the steps' places, which jump, too.
+
+        Zeros where frames of one step scatter nearly as much.
+        """
         if not self._steps or not self._still:
             return np.zeros(surface.PARAMETERS)
         steps_mm2, still_mm2 = (np.mean(squared, axis=0) for squared in (self._steps, self._still))
-        return np.asarray(np.maximum(steps_mm2 - 2 * still_mm2, 0.0))
+        return np.asarray(np.maximum(steps_mm2 - 2 * still_mm2 - 2 * place_mm2, 0.0))
 
 
 @dataclass(frozen=True)

@@ -344,7 +344,9 @@ class Tracker:
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
         if self._errors_due is not None and np.isnan(self._fit_mm2).any():
             self._estimate_errors(*self._errors_due)
-        covariance_mm2 = self._fit_mm2 + np.diag(self._place_mm2(shifts_rad) + self._jumps.variance_mm2())
+        places_mm2 = np.mean([*self._places_mm2.values()], axis=0) if self._places_mm2 else 0.0
+        apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(places_mm2)
+        covariance_mm2 = self._fit_mm2 + np.diag(apart_mm2)
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
             time_s=time_s,
