@@ -190,6 +190,7 @@ def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
     assert [(line["kind"], line["name"]) for line in first.told] == [("maintenance", "pump_resonance")]
     (driven,) = first.alarmed("pump_resonance")
     assert "the pump's strokes, 48.1 Hz, drive the mirror's vibration at 48." in driven
+    assert [line["message"] for line in report_of(first.folder, capsys)] == [driven]
     second = Hold(tmp_path, 7.0, stack)
     minutes(second, 0.0, 3, 48.0 * 1.01)
     second.end()
