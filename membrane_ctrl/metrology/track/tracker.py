@@ -25,6 +25,7 @@ _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
+_OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
 _SIGMA_EVERY_S = 1.25  # errors change slowly, and the covariance costs as much as five fits
 
 
@@ -73,6 +74,7 @@ class Tracker:
         self._mean_place: tuple[float, FloatArray] | None = None  # its time, parameters: of the last five steps
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
         self._fit_mm2, self._covariance_s = np.full((surface.PARAMETERS,) * 2, math.nan), -math.inf
+        self._used_share = math.nan  # of the bins, when errors were estimated
         self._prepared_rad = (math.nan, math.nan)
         self._left, self._count = np.zeros(scene.index.size), 0
 
@@ -342,8 +344,10 @@ class Tracker:
     ) -> TrackedFrame:
         if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
-        if self._errors_due is not None and np.isnan(self._fit_mm2).any():
-            self._estimate_errors(*self._errors_due)
+        used = float(np.mean(fit.weights > 0))
+        if not abs(used - self._used_share) < _OTHER_BINS:  # at first, and where something covers other bins
+            self._fit_mm2, self._used_share = np.full_like(self._fit_mm2, math.nan), used
+            self._estimate_errors(fit, shifts_rad)
         places_mm2 = np.mean([*self._places_mm2.values()], axis=0) if self._places_mm2 else 0.0
         apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(places_mm2)
         covariance_mm2 = self._fit_mm2 + np.diag(apart_mm2)
@@ -358,7 +362,7 @@ class Tracker:
             verdict=fault.verdict,
             reason=fault.reason,
             rest_share=rest,
-            used_share=float(np.mean(fit.weights > 0)),
+            used_share=used,
             swing_adu=self._swing_adu * (1 + float(fit.light[1, 0])),
             lost=fault.lost,
         )
