@@ -345,11 +345,12 @@ class Tracker:
         if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
         used = float(np.mean(fit.weights > 0))
-        if not abs(used - self._used_share) < _OTHER_BINS:  # at first, and where something covers other bins
+        other = not abs(used - self._used_share) < _OTHER_BINS  # at first, and where something covers bins
+        if other or np.isnan(self._fit_mm2).any():
             self._fit_mm2, self._used_share = np.full_like(self._fit_mm2, math.nan), used
             self._estimate_errors(fit, shifts_rad)
-        places_mm2 = np.mean([*self._places_mm2.values()], axis=0) if self._places_mm2 else 0.0
-        apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(places_mm2)
+        places_mm2 = [*self._places_mm2.values()] or [np.zeros(surface.PARAMETERS)]
+        apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(np.mean(places_mm2, axis=0))
         covariance_mm2 = self._fit_mm2 + np.diag(apart_mm2)
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
