@@ -56,6 +56,7 @@ class Checked:
     state: motion.TrackedPoints  # the bins' points with their surface
     flags: tuple[integrity.Flag, ...]  # frames that do not belong
     film_um: FloatArray  # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
+    film_noise_um: float  # 1 sigma of each of these places
     light_left: float  # RMS of their light, relative, that the phases do not know of
 
     @property
@@ -177,7 +178,7 @@ def _check(
             inner = np.all(inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)
             scene = attempt.scene.part(inner) if np.mean(inner) > 1 / 2 else attempt.scene
             flat = attempt.phase_rad.reshape(2, -1)
-            light, film_um = evidence.light_and_film(stack, binned, scene, attempt.view.used, flat)
+            light, film_um, noise_um = evidence.light_and_film(stack, binned, scene, attempt.view.used, flat)
             left = light - (1.0 if stack.light is None else stack.light)
             if np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN) and done < rounds:
                 stack = replace(stack, light=light)  # a round with the light that each frame had
@@ -186,7 +187,7 @@ def _check(
             shape = attempt.view.mask.shape
             fitted = (attempt.view, attempt.phase_rad, near.reshape(shape), attempt.tracer, attempt.state)
             light_left = float(np.sqrt(np.mean(np.square(left[:, [k for axis in attempt.view.used for k in axis]]))))
-            return Checked(stack, binned, *fitted, _merged(flags, known), film_um, light_left)
+            return Checked(stack, binned, *fitted, _merged(flags, known), film_um, noise_um, light_left)
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if pair is not None and pair.swapped_with is not None and not {pair.frame, pair.swapped_with} & set(known):
             order = list(range(len(stack.patterns)))

@@ -261,7 +261,8 @@ def _vertex(bench: TrialBench, sigmas: SigmasConfig, checked: Checked, moved_um:
 
 def _film_um(film: FilmMotion) -> float:
     """RMS motion of the film left in the phases of the frames."""
-    return math.hypot(_SEEN_UM, _SEEN_SHARE * film.moved_um) if film.worth_correcting else film.moved_um
+    left = (_SEEN_UM, _SEEN_SHARE * film.moved_um) if film.worth_correcting else (film.moved_um,)
+    return math.hypot(*left, film.noise_um)
 
 
 def _film(bench: TrialBench, spread: GeometrySpread, film: FilmMotion) -> tuple[list[budget.Source], list[str]]:

@@ -78,6 +78,7 @@ class FilmMotion:
 
     told_um: tuple[FloatArray, FloatArray]  # at the used sinusoids of x and of y, about the mean of both
     x_to_y_sigma_um: float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
+    noise_um: float  # 1 sigma of the fringes' part in each of these places
 
     @classmethod
     def of(cls, checked: Checked) -> "FilmMotion":
@@ -85,17 +86,25 @@ class FilmMotion:
 
         The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre, where the laser's
         noise is one. Of a difference between the axes they make a figure: there the laser counts, as far as a film
-        that moves so much from frame to frame moves from one axis to the other.
+        that moves so much from frame to frame moves from one axis to the other. What the fringes tell is in part
+        noise: only what their scatter has beyond it is motion.
         """
         x, y = checked.view.used
         seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
-        readings_um, noise_um = checked.stack.displacement_um, LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
+        within_um2 = float(np.var(np.concatenate(seen)))
+        noise_um2 = checked.film_noise_um**2 * (1 - 2 / (len(x) + len(y)))  # the means of both axes are taken off
+        moving = max(1 - noise_um2 / max(within_um2, 1e-12), 0.0)
+        readings_um, laser_um = checked.stack.displacement_um, LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
         x_to_y_um = float(readings_um[x].mean() - readings_um[y].mean())
-        share = motion_share(float(np.std(np.concatenate(seen))), noise_um)
+        least, most = (motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0))
+        # noise may hide a motion, which the laser tells by itself where it is beyond 2 sigma
+        share = float(np.clip(1 - (2 * laser_um) ** 2 / max(x_to_y_um**2, 1e-12), least, most))
         # the figure is that of all readings' mean, also where a frame is left out
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
         parts = np.nan_to_num(about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y)))
-        return cls((seen[0] + parts[0], seen[1] + parts[1]), math.sqrt(share) * noise_um + 0 * x_to_y_um)
+        told_um = (moving * seen[0] + parts[0], moving * seen[1] + parts[1])
+        sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
+        return cls(told_um, sigma_um, checked.film_noise_um)
 
     @property
     def moved_um(self) -> float:

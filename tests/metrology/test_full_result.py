@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +11,16 @@ import pytest
 from metrology_truth import cone, v_fold
 from rendered_sets import FILM, bench, good_set, patterns, stack_of
 
+from benchmarks import coverage
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full, tukey
+from membrane_ctrl.metrology.full import FilmMotion, FullResult, measure_pixels, reconstruct_full, tukey
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
+from tests.support.tracked_errors import rms
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
 INSIDE = np.hypot(X, Y) <= 475
@@ -111,6 +114,40 @@ def test_motion_is_taken_out_of_the_phase() -> None:
     without = float(np.std(surface_error_um(untold.surface, FILM, mean_um)))
     assert with_laser <= 0.15
     assert without > 4 * with_laser
+
+
+@pytest.mark.parametrize(
+    ("motion_um", "most_um", "most_left_um"),
+    [
+        (lambda _: 0.0, 0.2, 0.01),
+        (lambda t: 2.0 * t, 0.77, 0.14),
+        (lambda t: 6.0 * t, 0.8, 0.15),
+        (lambda t: 1.5 * math.cos(math.pi * t / 0.8), 1.0, 0.26),
+    ],
+    ids=["rest", "slow", "fast", "turning"],
+)
+def test_noisy_pictures_move_no_film_and_hide_no_motion(
+    motion_um: Callable[[float], float], most_um: float, most_left_um: float
+) -> None:
+    """The laser tells a motion from x to y with a noise of 0.7 um, most of which was taken out of a film at rest."""
+    optics, rng, off_um, sigma_um, left_um, film_um = bench(noise_adu=3.0), np.random.default_rng(6), [], [], [], []
+    for seed in (1, 2, 3):
+        stack = good_set(optics, motion_um=motion_um, seed=seed)
+        checked, place_um = check(stack, optics), stack.displacement_um
+        for _ in range(30):
+            noisy = replace(checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size))
+            film = FilmMotion.of(replace(checked, stack=noisy))
+            told_um = [told * film.worth_correcting for told in film.told_um]
+            off = [told - place_um[used] for told, used in zip(told_um, checked.view.used, strict=True)]
+            off_um.append(off[0].mean() - off[1].mean())
+            sigma_um.append(math.hypot(film.x_to_y_sigma_um, told_um[0].mean() - film.told_um[0].mean()))
+            left_um += [np.std(one) for one in off]
+        budget = coverage.measured(stack, optics)[1].budget
+        film_um.append(next(source.sigma for source in budget.sources if source.name == "film_um"))
+    assert rms(off_um) <= most_um
+    assert rms(np.divide(off_um, sigma_um)) <= 1.45
+    assert rms(left_um) <= 1.1 * rms(film_um) <= 0.35
+    assert rms(left_um) <= most_left_um
 
 
 @pytest.mark.parametrize(("flicker", "swing_um"), [(0.02, 0.0), (0.0, 14.0)], ids=["lamp", "film"])

@@ -22,6 +22,8 @@ from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLE = 6_000
+# For the film's places, whose noise would be taken for motion: as many pixels, whatever the size of the bins
+_SAMPLED_PX = 96_000
 _SEVERAL_RAD = 6.0  # standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
 # Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
 _EDGE_RAD = 0.5
@@ -36,9 +38,9 @@ class SampledBins:
     phase_rad: FloatArray  # (2, n): predicted absolute phase, film at its mean displacement
     sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
 
-    def thinned(self) -> "SampledBins":
+    def thinned(self, enough: int = _SAMPLE) -> "SampledBins":
         """Enough of the bins."""
-        return self.part(slice(None, None, max(1, self.index.size // _SAMPLE)))
+        return self.part(slice(None, None, max(1, self.index.size // enough)))
 
     def part(self, which: slice | BoolArray) -> "SampledBins":
         """Some of the bins."""
@@ -54,6 +56,7 @@ class Evidence:
     swing: float  # b of a sinusoid, hi - lo of a Gray frame, 0 else
     step_rad: float  # delta of a sinusoid: how far its phase step is from the stated one
     moved_um: float  # e of a sinusoid: how far the film is from where the laser says
+    moved_sigma_um: float  # its noise, if what is left over is noise
     rest: float  # RMS of what is left over, as a share of the light
     saturated: float  # share of bins with a saturated pixel
     shows: int  # frame whose pattern this one fits best
@@ -77,15 +80,16 @@ def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list
 
 def light_and_film(
     stack: FrameStack, binned: Binned, scene: SampledBins, used: tuple[list[int], list[int]], phase_rad: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Level and swing (2, frames) of the used sinusoids about the mean of their axis, and the film's places in um.
+) -> tuple[FloatArray, FloatArray, float]:
+    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's places, 1 sigma, um.
 
     Places are those of the used sinusoids of x and then of y. Each frame is compared with the light that the other
     axis saw: in that of its own axis it leaves waves, which would hide a tenth of what differs. Phases `phase_rad`
     (2, bins) that differ smoothly from the surface's (a film that moved between the axes, a wrong geometry) and a
     contrast that differs over the mirror (blur) would be taken for both.
     """
-    scene, light, film_um = scene.thinned(), np.ones((2, len(stack.patterns))), np.empty(0)
+    scene, light = scene.thinned(_SAMPLED_PX // binned.bin_px**2), np.ones((2, len(stack.patterns)))
+    film_um, sigma_um = np.empty(0), np.empty(0)
     told_um = np.nan_to_num(stack.displacement_um - stack.mean_reading_um)
     spread_rad = scene.phase_rad.std(axis=1)
     u, v = (scene.phase_rad - scene.phase_rad.mean(axis=1)[:, None]) / spread_rad[:, None]
@@ -104,7 +108,8 @@ def light_and_film(
         seen = np.array([[each.level, each.swing] for each in found]).T
         light[:, own] = seen / seen.mean(axis=1, keepdims=True)
         film_um = np.append(film_um, told_um[own] + [each.moved_um for each in found])
-    return light, film_um
+        sigma_um = np.append(sigma_um, [each.moved_sigma_um for each in found])
+    return light, film_um, float(np.sqrt(np.mean(sigma_um**2)))
 
 
 @dataclass(frozen=True)
@@ -140,27 +145,29 @@ def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: flo
     return _Template("sin", np.stack(columns), ones.astype(bool))
 
 
-def _solve(seen: FloatArray, template: _Template, light: FloatArray) -> tuple[FloatArray, float]:
-    """Coefficients and the RMS of the rest over the light."""
+def _solve(seen: FloatArray, template: _Template, light: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
     sure = template.sure
     columns = (template.columns * light)[:, sure]
     normal = columns @ columns.T
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))  # columns of very different size
-    solved = np.linalg.pinv(normal / np.outer(scale, scale)) @ (columns @ seen[sure] / scale) / scale
-    rest = seen[sure] - solved @ columns
-    return solved, float(np.sqrt(np.mean(rest**2)) / np.mean(light[sure]))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    solved = inverse @ (columns @ seen[sure])
+    rest = float(np.sqrt(np.mean((seen[sure] - solved @ columns) ** 2)))
+    return solved, rest * np.sqrt(np.maximum(np.diag(inverse), 0.0)), rest / float(np.mean(light[sure]))
 
 
 def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int) -> Evidence:
-    solved, rest = _solve(seen, template, light)
+    solved, sigma, rest = _solve(seen, template, light)
     if template.role == "sin":
         swing = float(np.hypot(solved[1], solved[2]))
         step = float(np.arctan2(solved[2], solved[1]))
-        return Evidence(float(solved[0]), swing, step, float(solved[3]) / max(swing, 1e-9), rest, saturated, shows)
+        moved_um, sigma_um = (float(each[3]) / max(swing, 1e-9) for each in (solved, sigma))
+        return Evidence(float(solved[0]), swing, step, moved_um, sigma_um, rest, saturated, shows)
     if template.role == "gray":
         lit = float(np.mean(template.columns[1][template.sure]))
-        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, rest, saturated, shows, lit)
-    return Evidence(float(solved[0]), 0.0, 0.0, 0.0, rest, saturated, shows)
+        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, 0.0, rest, saturated, shows, lit)
+    return Evidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
 def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int) -> int:
