@@ -34,9 +34,12 @@ class Bands:
         self._rad_per_row = self._told = np.zeros(0)
         self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
         self._power: FloatArray | None = None
+        self._steady = np.ones(row.size, np.float32)
 
     def gain(self, amplitudes: FloatArray) -> Singles:
         """What multiplies the light of each bin (n,)."""
+        if not amplitudes.size:
+            return self._steady
         return np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row]
 
     def sums(self, values: Singles) -> FloatArray:
@@ -68,8 +71,6 @@ class Bands:
 
     def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
         """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""
-        if not amplitudes.size:
-            return
         (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
         change = self._place * (across * cosine - along * sine)
         self._told = _KEEPS * self._told + change**2 @ rows[1]

@@ -34,7 +34,9 @@ _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
 _SETTLED_MM = 1e-5
 _ALL_ADU = 1e6  # a reach beyond which no bin is
 _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
-_LINEAR_MM = 3e-4  # between two exact traces the phases follow their derivatives: nanometres off at most
+_LINEAR_MM = (
+    1e-3  # at the rim; between two exact traces phases follow their derivatives, 0.3 nm of figure off at most
+)
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave

@@ -26,7 +26,7 @@ _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
 _BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
-_SIGMA_EVERY_S = 1.25  # errors change slowly, and the covariance costs as much as five fits
+_SIGMA_EVERY_S = 2.5  # errors change slowly, and the covariance costs as much as eight fits
 
 
 class Tracker:
@@ -332,7 +332,8 @@ class Tracker:
     ) -> None:
         self._last, self._light, self._shown_rad = fit, light, shifts_rad
         self._clear = self._seen / self._bands.gain(fit.bands)
-        self._bands.refine(self._fitter.rows(), fit.bands)
+        if fit.bands.size:
+            self._bands.refine(self._fitter.rows(), fit.bands)
         self._last_time_s, self._last_displacement_um = time_s, displacement_um
         self._scale_adu = self._scale_of(fit)
         self._left, self._count = self._left + fit.residual_adu, self._count + 1
