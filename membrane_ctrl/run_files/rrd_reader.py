@@ -126,14 +126,13 @@ def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[
 
 
 def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]:
+    whole = None
     try:
         chunks = read_chunks(path, entities)
         closed, rest = ending(path)
-        if not closed and not rest:
-            column_reader.add_note(notes, f"{path.name}: has no end: still written, cut off, or its recorder killed")
-        if not rest:
+        if closed:
             return chunks
-        why = f"it ends {rest} bytes into a message"
+        whole, why = (None, f"it ends {rest} bytes into a message") if rest else (chunks, "it has no end")
     except FAULTS as error:
         why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
     try:
@@ -143,6 +142,9 @@ def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]
     else:
         column_reader.add_note(notes, f"{path.name}: damaged or truncated, read from its copy in {REPAIRED}/ ({why})")
         return chunks
+    if whole is not None:
+        column_reader.add_note(notes, f"{path.name}: has no end: still written, cut off, or its recorder killed")
+        return whole
     try:
         chunks, lost_bytes = salvage(path, entities)
     except OSError as error:

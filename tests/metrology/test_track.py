@@ -197,7 +197,8 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     faulty = {
         "frozen": lambda: good,
         "hand": lambda: hand(bench.frame(), 40),
-        "grey hand": lambda: hand(bench.frame(), 40, float(np.median(bench.scene.light_adu[0]))),
+        "grey hand": lambda: hand(bench.frame(), 36, float(np.median(bench.scene.light_adu[0]))),
+        "large grey hand": lambda: hand(bench.frame(), 44, float(np.median(bench.scene.light_adu[0]))),
         "body": lambda: hand(bench.frame(), 100),
         "dark": lambda: bench.frame(gain=0.1),
         "bright": lambda: bench.frame(gain=2.5),
@@ -217,7 +218,8 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
     [
         ("frozen", "rejected", "frozen"),
         ("hand", "degraded", "covered"),
-        ("grey hand", "rejected", "covered or order lost"),
+        ("grey hand", "degraded", "covered"),
+        ("large grey hand", "rejected", "covered or order lost"),
         ("body", "rejected", "covered"),
         ("dark", "rejected", "dark"),
         ("bright", "rejected", "saturated"),

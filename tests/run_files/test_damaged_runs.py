@@ -223,12 +223,15 @@ def test_a_torn_segment_gives_its_whole_messages(tmp_path: Path, share: float, b
     assert _content(tmp_path) == before
 
 
-def test_a_repaired_copy_is_read_instead(tmp_path: Path) -> None:
+@pytest.mark.parametrize("within", [True, False])
+def test_a_repaired_copy_is_read_instead(tmp_path: Path, within: bool) -> None:
+    """Wherever the segment was cut off: one that ends between two messages looks like that of a killed recorder."""
     rows, _ = night(4, 0.02, "typical", [])
     path = segment(tmp_path, rows)
     (tmp_path / "repaired").mkdir()
     shutil.copy(path, tmp_path / "repaired")
-    path.write_bytes(path.read_bytes()[:100_000])
+    end = next(message.end for message in whole_messages(path) if message.end > 100_000)
+    path.write_bytes(path.read_bytes()[: end - within])
     run = open_run(tmp_path)
     assert run.ticks(["error_um"]).num_rows == len(rows)
     assert any("read from its copy in repaired/" in note for note in run.notes)

@@ -228,10 +228,8 @@ class Tracker:
             return tracked.rejected_frame(time_s, "frozen: the frame is identical to the one before")
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
-        faults = [
-            *tracked.light_faults(float(np.mean(saturated)), light, covered),
-            *tracked.light_changes(light, self._light, self._anchor_light),
-        ]
+        faults = tracked.light_faults(float(np.mean(saturated)), light, covered)
+        faults += tracked.light_changes(light, self._light, self._anchor_light)
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
             return tracked.rejected_frame(time_s, rejected.reason)
