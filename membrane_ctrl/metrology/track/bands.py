@@ -16,7 +16,7 @@ _CLEAR = 25.0
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
 _FINER = 16  # steps of the frequency in one over the picture's height
-_KEEPS = 0.9  # share of former frames in the mean power, and in what tells a wave's frequency
+_KEEPS = 0.9  # share of former frames in what tells a wave's frequency
 
 
 class Bands:
@@ -33,7 +33,6 @@ class Bands:
         self._place = np.arange(int(row.max()) + 1) - row.mean()
         self._rad_per_row = self._told = np.zeros(0)
         self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
-        self._power: FloatArray | None = None
         self._steady = np.ones(row.size, np.float32)
 
     def gain(self, amplitudes: FloatArray) -> Singles:
@@ -52,22 +51,24 @@ class Bands:
         return np.asarray(np.linalg.solve((self.waves * size) @ self.waves.T, self.waves @ pull), float)
 
     def search(self, rows: FloatArray) -> bool:
-        """Whether what fits leave shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
+        """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
         size = _FINER * self._place.size
         power = np.abs(np.fft.rfft(rows[0], size)[: self._place.size // 2 * _FINER]) ** 2
-        power /= max(float(np.mean(power)), 1e-30)
-        self._power = power if self._power is None else _KEEPS * self._power + (1 - _KEEPS) * power
-        around = ndimage.median_filter(self._power.reshape(-1, _FINER).mean(axis=1), 2 * _AROUND + 1)
-        clear = self._power / np.maximum(np.repeat(around, _FINER), 1e-30)
+        around = ndimage.median_filter(power.reshape(-1, _FINER).mean(axis=1), 2 * _AROUND + 1)
+        clear = power / np.maximum(np.repeat(around, _FINER), 1e-30)
         clear[: _LEAST_BANDS * _FINER] = 0.0
         found_rad = 2 * np.pi * int(np.argmax(clear)) / size
         apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
         if len(apart) == _MOST or not apart.all() or np.max(clear) < _CLEAR:
             return False
-        self._power = None
         self._rad_per_row, self._told = np.append(self._rad_per_row, found_rad), np.append(self._told, 0.0)
         self._draw()
         return True
+
+    def keep(self, count: int) -> None:
+        """Forget all waves but the first `count` of 2 k rows."""
+        self._rad_per_row, self._told = self._rad_per_row[: count // 2], self._told[: count // 2]
+        self._draw()
 
     def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
         """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""

@@ -34,10 +34,9 @@ _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
 _SETTLED_MM = 1e-5
 _ALL_ADU = 1e6  # a reach beyond which no bin is
 _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
-_LINEAR_MM = (
-    1e-3  # at the rim; between two exact traces phases follow their derivatives, 0.3 nm of figure off at most
-)
+_LINEAR_MM = 1e-3  # at the rim; between two exact traces phases follow their derivatives: 0.3 nm off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
+Shifts = tuple[float, float]  # phase steps of x and y
 _UNKNOWNS = PARAMETERS + 3 * TERMS
 _STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
 # Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In smaller ones light that
@@ -96,9 +95,7 @@ class FrameFitter:
         self._maps = np.empty_like(self._pull[:3])
         self._response = scene.response.astype(np.float32)
 
-    def fit(
-        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach_adu: FloatArray
-    ) -> FrameFit:
+    def fit(self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: FloatArray) -> FrameFit:
         """Fit a frame from the last solution.
 
         Parameters
@@ -121,12 +118,12 @@ class FrameFitter:
             self._inverse = None
         return found
 
-    def prepare(self, shifts_rad: tuple[float, float], start: FrameFit) -> None:
+    def prepare(self, shifts_rad: Shifts, start: FrameFit) -> None:
         """Make the matrix for frames with these phase steps that will be fitted from `start`."""
         self._inverse = self._inverted(shifts_rad, start.surface, start.light, start.weights)
 
     def _descend(
-        self, seen_adu: Singles, shifts_rad: tuple[float, float], start: FrameFit, reach: FloatArray, patient: bool
+        self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: FloatArray, patient: bool
     ) -> FrameFit:
         """Take steps until they vanish, lead astray or need too many matrices; small steps may if `patient`."""
         shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
@@ -156,7 +153,7 @@ class FrameFitter:
     def _evaluate(
         self,
         seen_adu: Singles,
-        shifts_rad: tuple[float, float],
+        shifts_rad: Shifts,
         shape: Surface,
         light: FloatArray,
         bands: FloatArray,
@@ -171,7 +168,7 @@ class FrameFitter:
         """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
         return self.bands.sums(self._out[2:])
 
-    def _shown(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
+    def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
         """What the kernels take a frame's light from."""
         turn, (_, offset) = self._turned(shape, light), self._cells.places
         turn[:, 0] += np.array(shifts_rad, np.float32)[:, None]
@@ -196,15 +193,13 @@ class FrameFitter:
             parts.append(self.bands.waves @ self.rows()[0])
         return np.concatenate(parts).astype(float)
 
-    def _waves(self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray) -> Singles:
+    def _waves(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> Singles:
         """Rows (6, n): dI by phi_x, by phi_y, by relative changes of A, B_x, B_y, and of all light."""
         waves = np.empty((6, self.scene.index.size), np.float32)
         light_waves(*self._shown(shifts_rad, shape, light), waves)
         return waves
 
-    def _inverted(
-        self, shifts_rad: tuple[float, float], shape: Surface, light: FloatArray, weights: Singles
-    ) -> FloatArray | None:
+    def _inverted(self, shifts_rad: Shifts, shape: Surface, light: FloatArray, weights: Singles) -> FloatArray | None:
         """(J^T W J)^-1; None if the bins do not determine the unknowns."""
         *waves, shown = self._waves(shifts_rad, shape, light)
         slow = [planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)]  # it need not be exact
@@ -224,7 +219,7 @@ class FrameFitter:
             return None
         return np.asarray(matrix * np.outer(scale, scale))
 
-    def covariance_mm2(self, fit: FrameFit, shifts_rad: tuple[float, float], noise_adu: float) -> FloatArray:
+    def covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, noise_adu: float) -> FloatArray:
         """Covariance (36, 36) of the parameters from what the fit leaves, or from the noise where that is larger.
 
         Errors of neighbouring bins belong together (light that wanders): what a square contributes to the solution
@@ -238,12 +233,8 @@ class FrameFitter:
         gain = self._inverse[:PARAMETERS].astype(np.float32)
         parts = zip(_STARTS, (*self.jacobian, *[self._basis] * 3), strict=True)
         slow = np.stack([np.tensordot(gain[:, at : at + PARAMETERS], planes, 1) for at, planes in parts], axis=1)
-        *waves, shown = self._waves(shifts_rad, fit.surface, fit.light)
-        left = self.scene.edge * fit.weights * fit.residual_adu
-        sums = self.in_squares(slow, np.stack(waves) * left)
-        if len(gain.T) > _UNKNOWNS:  # bands are no planes
-            bands = gain[:, _UNKNOWNS:, None, None] * np.array([1, 0, 0], np.float32)[:, None]
-            sums += self.in_squares(bands, self.bands.waves[:, self.bands.row] * shown * left)
+        waves = self._waves(shifts_rad, fit.surface, fit.light)[:5]  # what bands pull changes errors by a thousandth
+        sums = self.in_squares(slow, waves * (self.scene.edge * fit.weights * fit.residual_adu))
         used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
         seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
         grown = np.sqrt(np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen)))

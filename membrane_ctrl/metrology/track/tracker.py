@@ -270,9 +270,15 @@ class Tracker:
         maps = self._last.light * brighter
         maps[:, 0] += brighter - 1  # the first term is 1 everywhere
         start = replace(self._last, light=maps)
+        known = len(self._bands.waves)
         fit = self._robust(seen, shifts_rad, start, left_out)
-        while not self._lost(fit) and self._bands.search(self._fitter.rows()):
-            fit = self._robust(seen, shifts_rad, fit, left_out)
+        while self._bands.search(self._fitter.rows()):
+            for _ in range(2):  # the second time with the frequency that the first one leaves
+                fit = self._robust(seen, shifts_rad, start if self._lost(fit) else fit, left_out)
+                if not self._lost(fit):
+                    self._bands.refine(self._fitter.rows(), fit.bands)
+        if self._lost(fit):
+            self._bands.keep(known)  # a lost order leaves fringes, which are no bands
         moved_um = displacement_um - self._last_displacement_um
         if self._lost(fit) and math.isfinite(moved_um):
             bowl = surface.Surface.hencky_bowl(1e-3 * moved_um, fit.surface.radius_mm).parameters
