@@ -210,7 +210,9 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "blank": lambda: np.full(SIZE, 120, np.uint8),
         "blank screen": lambda: noisy_grey(float(np.median(bench.scene.light_adu[0]))),
     }
-    return tracker.follow(faulty[name](), STILL, 0.05), tracker.follow(bench.frame(2.0), STILL, 0.1)
+    found = tracker.follow(faulty[name](), STILL, 0.05)
+    assert not len(tracker._bands.waves), "fringes of a lost order are no bands"
+    return found, tracker.follow(bench.frame(2.0), STILL, 0.1)
 
 
 @pytest.mark.parametrize(
