@@ -208,10 +208,11 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "tilt by half a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM / 2})),
         "knock": lambda: bench.frame(film=with_terms({3: 20.0})),
         "blank": lambda: np.full(SIZE, 120, np.uint8),
+        "stripes": lambda: (120 + 30 * np.cos(0.9 * np.arange(SIZE[0]))[:, None] + np.zeros(SIZE)).astype(np.uint8),
         "blank screen": lambda: noisy_grey(float(np.median(bench.scene.light_adu[0]))),
     }
     found = tracker.follow(faulty[name](), STILL, 0.05)
-    assert not len(tracker._bands.waves), "fringes of a lost order are no bands"
+    assert not len(tracker._bands.waves), "what a lost order leaves is no bands"
     return found, tracker.follow(bench.frame(2.0), STILL, 0.1)
 
 
@@ -232,6 +233,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("knock", "degraded", "knocked"),
         ("blank", "rejected", "no fringes"),
         ("blank screen", "rejected", "no fringes"),
+        ("stripes", "rejected", "no fringes"),
     ],
 )
 def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, verdict: str, reason: str) -> None:
