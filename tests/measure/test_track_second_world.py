@@ -190,6 +190,24 @@ def test_bands_of_a_rolling_shutter_are_no_shape(still: Still, bands: float, siz
     assert 0.6 < found / rms(np.array(sigma_um[2:])) < 1.5
 
 
+def test_waves_stay_where_they_are_while_there_are_no_bands(still: Still) -> None:
+    """A screen at full brightness has no pulses; their frequency must not walk away meanwhile."""
+    random, known = np.random.default_rng(7), Bands(still.scene.row)
+    fitter = FrameFitter(still.scene, known, still.fitter.jacobian)
+    turns = still.scene.row / (still.scene.row.max() + 1) * 2 * math.pi
+    off_um = []
+    for size in [0.02] * 4 + [0.0] * 200 + [0.02] * 4:
+        pulses = size * np.cos(25.0 * turns + random.uniform(0, 2 * math.pi))
+        seen = still.light_adu() * (1 + pulses) + random.normal(0.0, 0.05, turns.size)
+        for _ in range(2):
+            fit = fitter.fit(seen.astype(np.float32), (0.0, 0.0), still.start, still.everything)
+            known.search(fitter.rows())
+        known.refine(fitter.rows(), fit.bands)
+        off_um.append(still.sag_off_um(fit))
+    assert len(known.waves) == 2
+    assert rms(np.array(off_um[-4:])) < 0.006
+
+
 def test_bands_that_are_none_move_no_figure(still: Still) -> None:
     """Light that wanders has few waves along the rows that look like wide bands, and noise has none."""
     random = np.random.default_rng(6)

@@ -11,12 +11,11 @@ from scipy import ndimage
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 _LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
-# Power over the median around it: bands have 100 and more, what fringes and light leave 20 at most
+# Power over the median around it and of all: bands have 100 and more, what fringes and light leave 20 at most
 _CLEAR = 25.0
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
 _FINER = 16  # steps of the frequency in one over the picture's height
-_KEEPS = 0.9  # share of former frames in what tells a wave's frequency
 
 
 class Bands:
@@ -54,8 +53,9 @@ class Bands:
         """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
         size = _FINER * self._place.size
         power = np.abs(np.fft.rfft(rows[0], size)[: self._place.size // 2 * _FINER]) ** 2
-        around = ndimage.median_filter(power.reshape(-1, _FINER).mean(axis=1), 2 * _AROUND + 1)
-        clear = power / np.maximum(np.repeat(around, _FINER), 1e-30)
+        means = power.reshape(-1, _FINER).mean(axis=1)
+        around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
+        clear = power / np.repeat(around, _FINER)
         clear[: _LEAST_BANDS * _FINER] = 0.0
         found_rad = 2 * np.pi * int(np.argmax(clear)) / size
         apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
@@ -74,7 +74,7 @@ class Bands:
         """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""
         (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
         change = self._place * (across * cosine - along * sine)
-        self._told = _KEEPS * self._told + change**2 @ rows[1]
+        self._told = self._told + change**2 @ rows[1]  # of all frames: where bands vanish, the frequency stays
         self._rad_per_row = self._rad_per_row + change @ rows[0] / np.maximum(self._told, 1e-30)
         self._draw()
 
