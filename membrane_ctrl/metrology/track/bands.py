@@ -11,8 +11,10 @@ from scipy import ndimage
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 _LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
-# Power over the median around it and of all: bands have 100 and more, what fringes and light leave 20 at most
-_CLEAR = 25.0
+# Power over the median around it and of all, of one frame and of the mean over some: bands have 100 and more. What
+# fringes and rounding leave has 10, and scatters from frame to frame.
+_CLEAR, _CLEAR_MEAN = 150.0, 25.0
+_KEEPS = 0.9  # share of the former frames in the mean
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
 _FINER = 16  # steps of the frequency in one over the picture's height
@@ -32,13 +34,11 @@ class Bands:
         self._place = np.arange(int(row.max()) + 1) - row.mean()
         self._rad_per_row = self._told = np.zeros(0)
         self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
-        self._steady = np.ones(row.size, np.float32)
+        self._steady, self._mean = np.ones(row.size, np.float32), np.zeros(self._place.size // 2 * _FINER)
 
     def gain(self, amplitudes: FloatArray) -> Singles:
         """What multiplies the light of each bin (n,)."""
-        if not amplitudes.size:
-            return self._steady
-        return np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row]
+        return np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row] if amplitudes.size else self._steady
 
     def sums(self, values: Singles) -> FloatArray:
         """Over each row (k, R), of values (k, n)."""
@@ -46,8 +46,7 @@ class Bands:
 
     def solved(self, rows: FloatArray) -> FloatArray:
         """Amplitudes (2 k,) from sums (2, R) of light times rest, and of light squared, of a fit without bands."""
-        pull, size = rows
-        return np.asarray(np.linalg.solve((self.waves * size) @ self.waves.T, self.waves @ pull), float)
+        return np.asarray(np.linalg.solve((self.waves * rows[1]) @ self.waves.T, self.waves @ rows[0]), float)
 
     def search(self, rows: FloatArray) -> bool:
         """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
@@ -56,11 +55,14 @@ class Bands:
         means = power.reshape(-1, _FINER).mean(axis=1)
         around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
         clear = power / np.repeat(around, _FINER)
+        self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
+        clear = np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN)
         clear[: _LEAST_BANDS * _FINER] = 0.0
         found_rad = 2 * np.pi * int(np.argmax(clear)) / size
         apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
-        if len(apart) == _MOST or not apart.all() or np.max(clear) < _CLEAR:
+        if len(apart) == _MOST or not apart.all() or np.max(clear) < 1:
             return False
+        self._mean *= 0
         self._rad_per_row, self._told = np.append(self._rad_per_row, found_rad), np.append(self._told, 0.0)
         self._draw()
         return True

@@ -350,8 +350,7 @@ class Tracker:
         if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
         used = float(np.mean(fit.weights > 0))
-        other = not abs(used - self._used_share) < _OTHER_BINS  # at first, and where something covers bins
-        if other or np.isnan(self._fit_mm2).any():
+        if not abs(used - self._used_share) < _OTHER_BINS or np.isnan(self._fit_mm2).any():
             self._fit_mm2, self._used_share = np.full_like(self._fit_mm2, math.nan), used
             self._estimate_errors(fit, shifts_rad)
         places_mm2 = [*self._places_mm2.values()] or [np.zeros(surface.PARAMETERS)]
