@@ -37,7 +37,7 @@ async def driver(board: PumpBoardEmulator) -> AsyncIterator[PumpBoard]:
     await made.close()
 
 
-def impatient(board: PumpBoardEmulator, timeout_s: float = 0.1) -> PumpBoard:
+def impatient(board: PumpBoardEmulator, timeout_s: float = 0.3) -> PumpBoard:
     return PumpBoard(f"tcp://127.0.0.1:{board.port}", timeout_s=timeout_s, watchdog_s=WATCHDOG_S)
 
 
@@ -192,7 +192,7 @@ async def test_a_late_answer_is_never_taken_for_a_later_sample(
 ) -> None:
     driver = impatient(board)
     await driver.open()
-    board.faults.delay_s = 0.15
+    board.faults.delay_s = 0.45
     with pytest.raises(LinkError):
         await driver.read()
     board.faults.delay_s = 0.0
