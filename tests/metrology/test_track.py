@@ -185,6 +185,16 @@ def hand(frame: NDArray[np.uint8], columns: int, light_adu: float = 9) -> NDArra
     return out
 
 
+def test_a_fit_that_stays_lost_knows_no_forgotten_bands(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A brighter frame may be lost and yet be accepted: bands that were forgotten then ended the acquisition."""
+    tracker, rows = bench.tracker(), np.arange(SIZE[0])[:, None]
+    assert tracker.follow(bench.frame(), STILL, 0.0).verdict == "ok"
+    banded = (bench.frame() * (1 + 0.1 * np.cos(0.9 * rows))).astype(np.uint8)
+    monkeypatch.setattr(Tracker, "_lost", lambda self, fit: True)
+    tracker.follow(banded, STILL, 0.1)
+    assert not len(tracker._bands.waves)
+
+
 def noisy_grey(light_adu: float) -> NDArray[np.uint8]:
     return np.random.default_rng(7).normal(light_adu, 1.0, SIZE).astype(np.uint8)
 

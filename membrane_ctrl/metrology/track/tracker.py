@@ -277,8 +277,9 @@ class Tracker:
                 fit = self._robust(seen, shifts_rad, start if self._lost(fit) else fit, left_out)
                 if not self._lost(fit):
                     self._bands.refine(self._fitter.rows(), fit.bands)
-        if self._lost(fit):
-            self._bands.keep(known)  # a lost order leaves fringes, which are no bands
+        if self._lost(fit) and len(self._bands.waves) > known:  # a lost order leaves fringes, which are no bands
+            self._bands.keep(known)
+            fit = self._robust(seen, shifts_rad, start, left_out)
         moved_um = displacement_um - self._last_displacement_um
         if self._lost(fit) and math.isfinite(moved_um):
             bowl = surface.Surface.hencky_bowl(1e-3 * moved_um, fit.surface.radius_mm).parameters
