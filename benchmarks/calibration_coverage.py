@@ -33,14 +33,7 @@ from benchmarks.coverage import (
     true_bench,
 )
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.calibration.sets import (
-    Bundle,
-    CalibrateOptions,
-    join,
-    phases_of,
-    phases_of_screen,
-    problem_of,
-)
+from membrane_ctrl.calibration.sets import Bundle, CalibrateOptions, join, phases_of, phases_of_screen, problem_of
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.file import ScreenMovedTable, origin_of, screen_elsewhere
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet

@@ -27,11 +27,7 @@ from membrane_ctrl.run_files.run_folder import create_run_folder
 DAY_S = 86_400.0
 WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little
 DURATION_S = 3600  # one whole segment
-_RINGS = {
-    "inputs": (400, MESSAGE_BYTES),
-    "shapes": (64, 1 << 16),
-    "events": (64, 4096),
-}
+_RINGS = {"inputs": (400, MESSAGE_BYTES), "shapes": (64, 1 << 16), "events": (64, 4096)}
 
 
 class HandClock(RunClock):

@@ -15,13 +15,7 @@ from typing import Any
 
 from firmware_iface.register_map import default_map
 
-CHANNELS = (
-    "displacement_um",
-    "gauge_pressure_pa",
-    "ambient_pressure_pa",
-    "air_temperature_c",
-    "gas_temperature_c",
-)
+CHANNELS = ("displacement_um", "gauge_pressure_pa", "ambient_pressure_pa", "air_temperature_c", "gas_temperature_c")
 _MAGIC = 0x4D425331
 _PARITIES = ("N", "E", "O")
 _I32_MAX = 2**31 - 1

@@ -247,12 +247,7 @@ _LEAST = 0.25  # below, noise and converter steps are three times larger than ne
 _LEAST_CONTRAST = 3.0
 
 
-def exposure_problem(
-    white: Pixels,
-    black: Pixels,
-    full_scale_adu: int,
-    exposure_ms: float,
-) -> str:
+def exposure_problem(white: Pixels, black: Pixels, full_scale_adu: int, exposure_ms: float) -> str:
     """The problem and its remedy, from frames (H, W) of a white and a black screen; empty if none."""
     saturated = float(np.mean(white >= full_scale_adu))
     bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))

@@ -31,19 +31,9 @@ FLOORS = {
     1: {"firmware_iface", "membrane_ctrl/__init__", "membrane_ctrl/model"},
     2: {"membrane_ctrl/config"},
     3: {"membrane_ctrl/control", "membrane_ctrl/instruments", "membrane_ctrl/metrology", "membrane_ctrl/processes"},
-    4: {
-        "membrane_ctrl/alarms",
-        "membrane_ctrl/controller",
-        "membrane_ctrl/geometry",
-        "membrane_ctrl/sim",
-    },
+    4: {"membrane_ctrl/alarms", "membrane_ctrl/controller", "membrane_ctrl/geometry", "membrane_ctrl/sim"},
     5: {"membrane_ctrl/control_port", "membrane_ctrl/measure", "membrane_ctrl/run_files"},
-    6: {
-        "membrane_ctrl/acquisition",
-        "membrane_ctrl/console",
-        "membrane_ctrl/recorder",
-        "membrane_ctrl/sessions",
-    },
+    6: {"membrane_ctrl/acquisition", "membrane_ctrl/console", "membrane_ctrl/recorder", "membrane_ctrl/sessions"},
     7: {
         "membrane_ctrl/calibration",
         "membrane_ctrl/commissioning",
@@ -167,17 +157,7 @@ def test_the_control_process_loads_no_image_code_and_no_rerun() -> None:
 # What runs code, or makes arbitrary objects, from bytes. Between this program's own parent and children
 # `multiprocessing` pickles by itself (what a child is given, what it reports): neither a file nor a name that a
 # stranger could give leads there.
-MAKES_OBJECTS = {
-    "pickle",
-    "_pickle",
-    "marshal",
-    "shelve",
-    "dill",
-    "cloudpickle",
-    "joblib",
-    "yaml",
-    "jsonpickle",
-}
+MAKES_OBJECTS = {"pickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "jsonpickle"}
 RUNS_CODE = {"eval", "exec", "compile", "__import__", "execfile"}
 
 

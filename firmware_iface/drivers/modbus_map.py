@@ -106,11 +106,7 @@ class ModbusValue:
     """
 
     def __init__(
-        self,
-        link: ModbusLink,
-        value_map: ValueMap,
-        rest: float | None = None,
-        clock: Clock = time.monotonic,
+        self, link: ModbusLink, value_map: ValueMap, rest: float | None = None, clock: Clock = time.monotonic
     ) -> None:
         self._link = link
         self._map = value_map

@@ -34,12 +34,7 @@ class Optoncdt1420Emulator(LineDevice):
     """Measures the mirror from behind, displacement 0 in the middle of its range (NaN: no target)."""
 
     def __init__(
-        self,
-        displacement_um: Sensor,
-        range_mm: int = 50,
-        direction: int = -1,
-        baud: int = 921_600,
-        name: str = "",
+        self, displacement_um: Sensor, range_mm: int = 50, direction: int = -1, baud: int = 921_600, name: str = ""
     ) -> None:
         super().__init__(baud)
         self._displacement_um = displacement_um
@@ -160,12 +155,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
     end = b"\r"
 
     def __init__(
-        self,
-        displacement_um: Sensor,
-        direction: int = -1,
-        baud: int = 9600,
-        parity: str = "N",
-        amplifiers: int = 1,
+        self, displacement_um: Sensor, direction: int = -1, baud: int = 9600, parity: str = "N", amplifiers: int = 1
     ) -> None:
         super().__init__(baud, parity=parity)
         self.error_state = 0

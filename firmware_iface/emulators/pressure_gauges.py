@@ -74,11 +74,7 @@ class VaisalaPtb330Emulator(LineDevice):
     end = b"\r"
 
     def __init__(
-        self,
-        ambient_pressure_pa: Sensor,
-        baud: int = 4800,
-        running: bool = False,
-        model: str = "PTB330",
+        self, ambient_pressure_pa: Sensor, baud: int = 4800, running: bool = False, model: str = "PTB330"
     ) -> None:
         super().__init__(baud, data_bits=7, parity="E")
         self.error_flags = "000"

@@ -28,12 +28,7 @@ class VentusEmulator(LineDevice):
     `streaming`: it was left streaming.
     """
 
-    def __init__(
-        self,
-        drive: Drive,
-        power_max_mw: float = 1000.0,
-        streaming: bool = False,
-    ) -> None:
+    def __init__(self, drive: Drive, power_max_mw: float = 1000.0, streaming: bool = False) -> None:
         super().__init__(115_200)
         self.registers = dict(_DEFAULTS)
         self.registers[2] = float(streaming)

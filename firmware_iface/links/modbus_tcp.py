@@ -125,12 +125,7 @@ class GuardedModbusTcp:
                 _fail_in_flight(client, f"{self.name}: connection lost")
 
         client = AsyncModbusTcpClient(
-            self._host,
-            port=self._port,
-            timeout=self._timeout_s,
-            retries=0,
-            reconnect_delay=0,
-            trace_connect=changed,
+            self._host, port=self._port, timeout=self._timeout_s, retries=0, reconnect_delay=0, trace_connect=changed
         )
         client.set_max_no_responses(_UNANSWERED_MAX)
         if not await client.connect():
@@ -154,9 +149,7 @@ class GuardedModbusTcp:
         """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
         what = f"{self.name}: writing {address}"
         reply = await self._exchange(
-            lambda client: client.write_register(address, word, device_id=self._unit_id),
-            WRITE_SINGLE,
-            what,
+            lambda client: client.write_register(address, word, device_id=self._unit_id), WRITE_SINGLE, what
         )
         if (reply.address, list(reply.registers)) != (address, [word]):
             raise LinkError(f"{what}: the reply confirms {list(reply.registers)} in {reply.address}")
@@ -170,9 +163,7 @@ class GuardedModbusTcp:
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(
-            lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
-            WRITE_MULTIPLE,
-            what,
+            lambda client: client.write_registers(address, list(words), device_id=self._unit_id), WRITE_MULTIPLE, what
         )
         if (reply.address, reply.count) != (address, len(words)):
             raise LinkError(f"{what}: the reply confirms {reply.count} registers from {reply.address}")

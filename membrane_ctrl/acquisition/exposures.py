@@ -74,13 +74,7 @@ class Exposures:
     """
 
     def __init__(
-        self,
-        camera: Camera,
-        screen: Screen,
-        frames: FrameWriter,
-        clock: CycleClock,
-        laser: Laser,
-        interval_s: float,
+        self, camera: Camera, screen: Screen, frames: FrameWriter, clock: CycleClock, laser: Laser, interval_s: float
     ) -> None:
         self._camera: ExposingCamera = camera if isinstance(camera, ExposingCamera) else _Grabbing(camera)
         self._screen: SettlingScreen = screen if isinstance(screen, SettlingScreen) else _Showing(screen)

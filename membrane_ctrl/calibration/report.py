@@ -14,15 +14,7 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import (
-    advice,
-    diagnose,
-    parameters,
-    propagate,
-    residuals,
-    solve,
-    verdict,
-)
+from membrane_ctrl.metrology.calibrate import advice, diagnose, parameters, propagate, residuals, solve, verdict
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic

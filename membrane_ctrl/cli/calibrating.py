@@ -84,8 +84,7 @@ def calibrate(
     free: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME[=SIGMA]",
-            help="How well this parameter is known, e.g. focal_relative=1e-4; repeatable.",
+            metavar="NAME[=SIGMA]", help="How well this parameter is known, e.g. focal_relative=1e-4; repeatable."
         ),
     ] = None,
     prior: PriorOption = None,

@@ -54,8 +54,7 @@ def hold(
     standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
     from_flat: FlatOption = False,
     autotune: Annotated[
-        bool,
-        typer.Option("--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."),
+        bool, typer.Option("--autotune", help="Tune the loop on trial once the mirror is held; ten minutes.")
     ] = False,
     json: JsonOption = False,
 ) -> int:
@@ -121,8 +120,7 @@ def safe(
     config: ConfigArgument,
     logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
     latch: Annotated[
-        bool,
-        typer.Option(help="Lock the pump until a person clears the latch; --no-latch spares a running program."),
+        bool, typer.Option(help="Lock the pump until a person clears the latch; --no-latch spares a running program.")
     ] = True,
 ) -> int:
     """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""

@@ -103,8 +103,7 @@ def export_figure(
 
 def film(
     folders: Annotated[
-        list[Path],
-        typer.Argument(metavar="SET...|RUN...", help="Capture sets at different pressures, or runs."),
+        list[Path], typer.Argument(metavar="SET...|RUN...", help="Capture sets at different pressures, or runs.")
     ],
     geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the sets' own.")] = None,
     prestrain: Annotated[float, typer.Option(help="RUN: pre-strain of the film, 1e-3 is 0.1 %.")] = 0.0,

@@ -20,11 +20,7 @@ _STATES = {
     State.FAULT: "pump is off: a person must clear the latched fault",
 }
 # the command that ends a state in which somebody is waited for, and its key
-_GO_ON = {
-    State.STANDBY: ("hold", " or key h"),
-    State.MANUAL: ("hold", " or key h"),
-    State.FAULT: ("ack", ""),
-}
+_GO_ON = {State.STANDBY: ("hold", " or key h"), State.MANUAL: ("hold", " or key h"), State.FAULT: ("ack", "")}
 _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 

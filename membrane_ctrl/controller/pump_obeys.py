@@ -161,11 +161,7 @@ class Part:
 
 # The vent costs 7 um of height, which the pump must restore. The pump comes last, at 0.8: its gas is needed on the
 # way to the setpoint anyway.
-PARTS = (
-    Part("off", 0.0, 0.0, 0.0, 1.2),
-    Part("vent", 0.0, 0.08, 0.35, 0.5),
-    Part("pump", 0.8, 0.0, 0.5, 1.0),
-)
+PARTS = (Part("off", 0.0, 0.0, 0.0, 1.2), Part("vent", 0.0, 0.08, 0.35, 0.5), Part("pump", 0.8, 0.0, 0.5, 1.0))
 _RATE_HZ = 50.0  # tick rate of the parts' times
 # At 50 Hz and with 1 um of noise the vent's speed has a standard deviation of 1.4 um/s, the pump's 0.6 um/s, and the
 # means of two 1.0 and 0.4 um/s. Three of them are clear; two and a half decide in the end.

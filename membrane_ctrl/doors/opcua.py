@@ -65,9 +65,7 @@ async def _nodes(server: Server, space: int, door: Door) -> dict[str, Node]:
     found = {}
     for each in TABLE:
         node = await mirror.add_variable(
-            ua.NodeId(f"{name}.{each.name}", space),
-            ua.QualifiedName(each.name, space),
-            0.0 if each.unit else "",
+            ua.NodeId(f"{name}.{each.name}", space), ua.QualifiedName(each.name, space), 0.0 if each.unit else ""
         )
         await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(each.says))))
         if each.unit:

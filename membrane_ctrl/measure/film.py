@@ -146,11 +146,7 @@ def _notes(figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure:
 
 
 def _table(
-    figures: list[film_fit.FilmFigure],
-    fit: film_fit.FilmFit,
-    departure: _Departure,
-    source: str,
-    notes: list[str],
+    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure, source: str, notes: list[str]
 ) -> dict[str, Any]:
     law, (strain, poisson, relative) = fit.law, fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)

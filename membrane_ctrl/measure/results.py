@@ -118,13 +118,7 @@ def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[
     }
     return {
         "schema": "membrane-result/1",
-        "zernike": {
-            "index": "noll",
-            "first": 1,
-            "normalisation": "rms",
-            "radius_mm": radius_mm,
-            "coeffs_um": coeffs,
-        },
+        "zernike": {"index": "noll", "first": 1, "normalisation": "rms", "radius_mm": radius_mm, "coeffs_um": coeffs},
         "fit": _fit_table(full),
         "quality": quality,
         "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},

@@ -188,10 +188,7 @@ def _axis_phases(
 
 
 def reconstruct_full(
-    optics: OpticsConfig,
-    checked: Checked,
-    pixels: PixelPoints,
-    start: reconstruct.HeightFunction | None = None,
+    optics: OpticsConfig, checked: Checked, pixels: PixelPoints, start: reconstruct.HeightFunction | None = None
 ) -> FullResult:
     """Fit the pixels and integrate the residual.
 

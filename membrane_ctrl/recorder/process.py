@@ -79,10 +79,7 @@ def prepare_rerun() -> None:
 
 
 def _record(
-    spec: RecorderSpec,
-    report: Callable[[Event], None],
-    asked: Callable[[], bool],
-    orphan: Callable[[], bool],
+    spec: RecorderSpec, report: Callable[[Event], None], asked: Callable[[], bool], orphan: Callable[[], bool]
 ) -> bool:
     """Record until the end; returns whether the process may exit normally."""
     from membrane_ctrl.recorder.recorder import Recorder

@@ -149,11 +149,7 @@ class Run:
         return not isinstance(duration_s, (int, float)) or until_s > duration_s - _WAY_DOWN_S
 
     def level(
-        self,
-        window_s: float,
-        start_s: float = -np.inf,
-        end_s: float = np.inf,
-        names: Sequence[str] = tables.NAMES,
+        self, window_s: float, start_s: float = -np.inf, end_s: float = np.inf, names: Sequence[str] = tables.NAMES
     ) -> Block:
         """What `overview` shows, as arrays for computing: codes are numbers, absent values NaN.
 

@@ -198,11 +198,7 @@ class HoldFeed:
                 self.marks.append((utc.timestamp(), event.text))
         if "status" in message:
             self.seen = replace(
-                self.seen,
-                role=str(greeting["role"]),
-                status=message["status"],
-                seen_s=time.monotonic(),
-                problem="",
+                self.seen, role=str(greeting["role"]), status=message["status"], seen_s=time.monotonic(), problem=""
             )
             self._take_ticks(message["status"].get("row") or {}, rings.get("telemetry"))
             self._take_figures(rings.get("shapes"))

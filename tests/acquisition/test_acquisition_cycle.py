@@ -21,12 +21,7 @@ from acquisition_fakes import (
 from acquisition_fakes import VirtualClock as Clock
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.acquisition.cycle import (
-    REJECTED_IN_A_ROW,
-    CycleDone,
-    CycleFailed,
-    ShapeCycle,
-)
+from membrane_ctrl.acquisition.cycle import REJECTED_IN_A_ROW, CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.model.clock import pause_s
 from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
 
@@ -42,14 +37,7 @@ class Bench:
         self.reader = reader
         self.exposures_left = 10**6
         self.cycle = ShapeCycle(
-            self.camera,
-            self.screen,
-            self.reconstructor,
-            PLAN,
-            frames,
-            self.clock,
-            FakeLaser(),
-            self._stopping,
+            self.camera, self.screen, self.reconstructor, PLAN, frames, self.clock, FakeLaser(), self._stopping
         )
 
     def done(self) -> CycleDone:

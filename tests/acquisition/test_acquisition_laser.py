@@ -19,11 +19,7 @@ NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))
 
 def row(mono_s: float, displacement_um: float, counter: float, quality: float = 0.0) -> bytes:
     return replace(
-        NOTHING,
-        mono_s=mono_s,
-        displacement_um=displacement_um,
-        sample_counter=counter,
-        displacement_quality=quality,
+        NOTHING, mono_s=mono_s, displacement_um=displacement_um, sample_counter=counter, displacement_quality=quality
     ).pack()
 
 

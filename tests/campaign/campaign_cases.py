@@ -273,12 +273,7 @@ CASES: tuple[Case, ...] = (
         for_s=2.0,
     ),
     _case("process stopped for ever", "-", wrong={"stalled": 1}),
-    _case(
-        "ticks 150 ms late",
-        "late",
-        wrong={"late_ms": 150},
-        moving=Reaction(SafeLevel.RAMP_DOWN, 8 * TICK_S),
-    ),
+    _case("ticks 150 ms late", "late", wrong={"late_ms": 150}, moving=Reaction(SafeLevel.RAMP_DOWN, 8 * TICK_S)),
     _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
     _case("control code raises", "tick_error", raises=True, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
     _case("camera lost", wrong={"camera_lost": 1}),

@@ -22,11 +22,7 @@ from hold_rig import BoardBench, HoldRig, LoopClock, a_hold, board_of, on_board
 
 from firmware_iface.drivers.bronkhorst import BronkhorstFlow, ModbusParameters
 from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
-from firmware_iface.roles import (
-    Bench,
-    BenchCommand,
-    DeviceRefusedError,
-)
+from firmware_iface.roles import Bench, BenchCommand, DeviceRefusedError
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import FaultLatch

@@ -14,11 +14,7 @@ from firmware_iface.drivers.modbus_map import ModbusValue, make_map
 from firmware_iface.emulators.modbus_server import RegisterRefusal, RegisterTable
 from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.role_bench import RoleBench, RoleDevices
-from firmware_iface.roles import (
-    DeviceRefusedError,
-    LinkDownError,
-    LinkError,
-)
+from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 
 class Registers:

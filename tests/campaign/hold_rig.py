@@ -14,13 +14,7 @@ from campaign_run import config_of
 from campaign_times import RATE_HZ, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
-from firmware_iface.roles import (
-    Bench,
-    BenchCommand,
-    BenchIdentity,
-    BenchReading,
-    LinkError,
-)
+from firmware_iface.roles import Bench, BenchCommand, BenchIdentity, BenchReading, LinkError
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller

@@ -74,11 +74,7 @@ NOTES: tuple[tuple[str, str, str], ...] = (
     ("barometer", "", "Harmless: only its changes are used, and the loop corrects a wrong feed-forward."),
     ("air thermometer", "", "Harmless: only its changes are used, and the loop corrects a wrong feed-forward."),
     ("gas thermometer", "", "Harmless: it is only recorded."),
-    (
-        "pump read-back",
-        "",
-        "Harmless: 0.05 of full scale is allowed, and the next start reports `pump_runs_on`.",
-    ),
+    ("pump read-back", "", "Harmless: 0.05 of full scale is allowed, and the next start reports `pump_runs_on`."),
     (
         "vent read-back",
         "",

@@ -231,10 +231,7 @@ def composed(folder: Path) -> Config:
 
 @pytest.mark.parametrize("answer", [{"ok": True}, {"ok": False, "refused": "not you"}])
 def test_a_running_hold_is_told_to_latch_and_that_is_enough_where_it_alone_has_the_pump(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    answer: dict[str, object],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], answer: dict[str, object]
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
     hold = Hold(tmp_path / "control.sock", answer)

@@ -155,10 +155,7 @@ def test_a_gap_of_the_laser_during_which_the_film_goes_is_no_lie() -> None:
 
 
 def grown(
-    leak: Callable[[float], float],
-    most: float,
-    duration_s: float,
-    flow: Callable[[float], float] | None = None,
+    leak: Callable[[float], float], most: float, duration_s: float, flow: Callable[[float], float] | None = None
 ) -> float:
     """When it is said."""
     growth = LeakGrowth()

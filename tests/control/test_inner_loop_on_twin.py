@@ -61,10 +61,7 @@ def test_ten_seconds_without_a_reading() -> None:
 
 def test_setpoint_change_down_is_as_fast_as_the_leak() -> None:
     held = hold(
-        LoopConfig(),
-        TwinConfig(start_error_um=0.0),
-        70.0,
-        target_um=lambda time_s: 0.0 if time_s < 20 else -20.0,
+        LoopConfig(), TwinConfig(start_error_um=0.0), 70.0, target_um=lambda time_s: 0.0 if time_s < 20 else -20.0
     )
     assert np.min(held.true_um) > -21.5
     assert np.abs(held.after(60.0) + 20.0).max() < 1.0

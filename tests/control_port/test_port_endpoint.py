@@ -66,9 +66,7 @@ async def dropped(crowd: Crowd, at_least: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "addresses",
-    [["127.0.0.2"] * 40, [f"127.0.{n}.2" for n in range(40)]],
-    ids=["one address", "forty addresses"],
+    "addresses", [["127.0.0.2"] * 40, [f"127.0.{n}.2" for n in range(40)]], ids=["one address", "forty addresses"]
 )
 async def test_who_does_not_shake_hands_keeps_nobody_out(
     addresses: list[str], tmp_path: Path, lab: Authority, config: PortConfig, monkeypatch: pytest.MonkeyPatch

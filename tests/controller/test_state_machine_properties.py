@@ -94,11 +94,7 @@ class Driver:
                 reading.latched_faults,
             )
         inputs = TickInputs(
-            now_s=self.tick * DT_S,
-            dt_s=DT_S,
-            reading=reading if link_up else None,
-            link_up=link_up,
-            commands=asked,
+            now_s=self.tick * DT_S, dt_s=DT_S, reading=reading if link_up else None, link_up=link_up, commands=asked
         )
         self.look(self.controller.tick(inputs), len(asked))
 

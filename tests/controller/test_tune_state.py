@@ -202,8 +202,7 @@ def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [{"limit_um": 99.0}, {"limit_um": math.nan}, {"duration_s": 1e5}, {"kind": "jump"}, {"version": 2}],
+    "changed", [{"limit_um": 99.0}, {"limit_um": math.nan}, {"duration_s": 1e5}, {"kind": "jump"}, {"version": 2}]
 )
 def test_an_experiment_without_bounds_does_not_exist(changed: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):

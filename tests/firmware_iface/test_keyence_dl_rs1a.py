@@ -178,11 +178,7 @@ def test_a_pulled_plug() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [
-        ({"baud": 115_200}, "baud"),
-        ({"amplifier": 15}, "amplifier"),
-        ({"direction": 2}, "direction"),
-    ],
+    [({"baud": 115_200}, "baud"), ({"amplifier": 15}, "amplifier"), ({"direction": 2}, "direction")],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

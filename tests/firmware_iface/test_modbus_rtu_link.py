@@ -294,8 +294,7 @@ def test_each_fault_is_an_error_and_passes(faults: SerialFaults) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"),
-    [("wrong_unit", "answer from unit 2"), ("wrong_function", "function code 4")],
+    ("fault", "message"), [("wrong_unit", "answer from unit 2"), ("wrong_function", "function code 4")]
 )
 def test_faults_of_the_protocol(fault: str, message: str) -> None:
     async def test(bus: Bus) -> None:

@@ -169,10 +169,7 @@ def test_a_torn_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path
 
 @pytest.mark.parametrize(
     ("image", "reason"),
-    [
-        (np.zeros((255, 306), np.uint8), "wrong size"),
-        (np.zeros((256, 306), np.uint16), "wrong bit depth"),
-    ],
+    [(np.zeros((255, 306), np.uint8), "wrong size"), (np.zeros((256, 306), np.uint16), "wrong bit depth")],
     ids=["size", "depth"],
 )
 def test_a_frame_of_another_kind_is_named(capture_set: Path, tmp_path: Path, image: np.ndarray, reason: str) -> None:

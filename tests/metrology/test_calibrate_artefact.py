@@ -82,10 +82,7 @@ def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
         there = bench_at(solution.problem.stated, values).geometry
         here = solution.bench.geometry
         shift = there.pinhole_mm - here.pinhole_mm, there.screen_origin_mm - here.screen_origin_mm
-        turns = (
-            _turn(here.rotation, there.rotation),
-            _turn(_rows(here), _rows(there)),
-        )
+        turns = (_turn(here.rotation, there.rotation), _turn(_rows(here), _rows(there)))
         change = np.concatenate([shift[0], turns[0], shift[1], turns[1]])
         moved = Geometry.from_config(OpticsConfig(geometry=changed(config, GENERAL_NAMES, change)))
         assert np.allclose(moved.rotation, there.rotation, atol=1e-9)

@@ -20,15 +20,7 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     poses_at,
     sigmas,
 )
-from membrane_ctrl.metrology.calibrate.residuals import (
-    BEYOND,
-    COLUMNS,
-    LOCAL,
-    MOTION,
-    SetPhases,
-    chunks,
-    residual_mm,
-)
+from membrane_ctrl.metrology.calibrate.residuals import BEYOND, COLUMNS, LOCAL, MOTION, SetPhases, chunks, residual_mm
 from membrane_ctrl.metrology.calibrate.separable import SetState, averaged, rim_harmonics
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface

@@ -219,10 +219,7 @@ def test_fringes_lean_on_their_reference() -> None:
     sinusoids = [k for k, p in enumerate(full.patterns) if p.role == "sin"]
     moved = good_set(optics, motion_um=lambda _t: 30.0, seed=2)
     stack = FrameStack(
-        moved.frames[sinusoids],
-        tuple(full.patterns[k] for k in sinusoids),
-        moved.displacement_um[sinusoids],
-        {},
+        moved.frames[sinusoids], tuple(full.patterns[k] for k in sinusoids), moved.displacement_um[sinusoids], {}
     )
     geometry = optics.geometry.model_copy(update={"reference_displacement_um": 0.0})
     optics = optics.model_copy(update={"geometry": geometry})

@@ -65,11 +65,7 @@ def test_hencky_amplitude_is_the_bowls_sag() -> None:
 
 @pytest.mark.parametrize(
     "start",
-    [
-        *(parabola(h, RADIUS_MM) for h in (10.0, 100.0)),
-        cone(40.0, RADIUS_MM),
-        v_fold(40.0, RADIUS_MM),
-    ],
+    [*(parabola(h, RADIUS_MM) for h in (10.0, 100.0)), cone(40.0, RADIUS_MM), v_fold(40.0, RADIUS_MM)],
     ids=["parabola 10", "parabola 100", "cone", "V-fold"],
 )
 def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untyped-def]

@@ -105,12 +105,7 @@ def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
         (Progressed("observe", 300.0, 320.0, 60.0), 2, 1.0, "Now: observe, 1:00 of about 5:00; 9:20 of holding left"),
         (Progressed("design"), 3, 40.0, "Now: design"),
         (Progressed("design", asks="which?"), 5, 4000.0, "Waiting for an answer on its terminal: which?"),
-        (
-            Progressed("verify", 600.0),
-            6,
-            100.0,
-            "killed or hangs; resume it with: membrane-ctrl tune run --resume",
-        ),
+        (Progressed("verify", 600.0), 6, 100.0, "killed or hangs; resume it with: membrane-ctrl tune run --resume"),
         (Progressed("verify", ended="interrupted"), 6, 0.0, "Ended after verify (interrupted); resume it with"),
         (Progressed("verify", ended="done"), 7, 0.0, "Done."),
     ],

@@ -494,10 +494,7 @@ def test_no_answer_applies_nothing(
     code: Exit,
 ) -> None:
     before = done.file("gains.toml").read_bytes()
-    assert asked(done, tmp_path, monkeypatch, answers) == (
-        code,
-        pytest.approx(done.head.before.kp_per_s, rel=0.02),
-    )
+    assert asked(done, tmp_path, monkeypatch, answers) == (code, pytest.approx(done.head.before.kp_per_s, rel=0.02))
     assert done.file("gains.toml").read_bytes() == before
     assert not done.done("apply")
     said = capsys.readouterr().err

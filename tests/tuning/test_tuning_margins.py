@@ -14,15 +14,7 @@ from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import RECOVERED_UM, Gains, PlantModel, load_step, margins, sensitivity_peak
-from tuning.proposal.candidates import (
-    Demands,
-    amigo,
-    lambda_tuned,
-    least_variance,
-    load_peak_um,
-    max_ki,
-    simc,
-)
+from tuning.proposal.candidates import Demands, amigo, lambda_tuned, least_variance, load_peak_um, max_ki, simc
 from tuning.proposal.design import candidate, cells, designs, refusal
 from tuning.proposal.prediction import Walks, _clipped, least_std_um, predict, preview
 

@@ -113,14 +113,7 @@ def _prior(taus_s: Series, first: int) -> tuple[Series, Series]:
     return np.hstack((np.zeros((len(rows), first)), rows)), rows @ (2 * np.log(taus_s))
 
 
-def _likeliest(
-    basis: Series,
-    power: Series,
-    count: Series,
-    likely: Series,
-    usual: Series,
-    start: Series,
-) -> Series:
+def _likeliest(basis: Series, power: Series, count: Series, likely: Series, usual: Series, start: Series) -> Series:
     """Logarithms of the intensities; Whittle's likelihood with its information matrix."""
 
     def cost(logs: Series) -> tuple[float, Series]:

@@ -14,12 +14,7 @@ from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import (
-    PARAMETERS,
-    Surface,
-    parameter_to_coeffs,
-    sag_gradient,
-)
+from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 

@@ -132,11 +132,7 @@ def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
 
 
 def run_trials(
-    benches: Sequence[TrialBench],
-    spread: GeometrySpread,
-    seed: int,
-    trials: Sequence[int],
-    first_set: int = 0,
+    benches: Sequence[TrialBench], spread: GeometrySpread, seed: int, trials: Sequence[int], first_set: int = 0
 ) -> FloatArray:
     """Parameters (trials, sets, 36) in mm of the trials with these numbers; all sets share the geometry of a trial.
 
