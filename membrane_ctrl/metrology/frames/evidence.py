@@ -3,12 +3,12 @@
 After the fit the phase of every bin is known without any single frame, so each frame alone gives its own phase step,
 brightness, contrast and film position. For a sinusoid with predicted phase psi = phi + d_k
 
-    I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi - b e (q - <q>) sin psi]
+    I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi + c4 cos 4 psi - b e (q - <q>) sin psi]
 
-with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta, b
-e, c2 and c3. The harmonics are the display's response, alike in all frames. A Gray frame has two levels, I = g (lo +
-(hi - lo) bit); white and black have one. Over thousands of bins noise does not matter; what is left over does not
-belong there.
+with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta,
+b e, c2, c3 and c4. The harmonics are the display's response, alike in all frames. A Gray frame has two levels,
+I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noise does not matter; what is left over
+does not belong there.
 """
 
 from collections.abc import Collection
@@ -141,7 +141,7 @@ def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: flo
         return _Template("gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool))
     psi = phase + pattern.shift_rad
     sine = np.sin(psi)
-    columns = [ones, np.cos(psi), -sine, -(slope - slope.mean()) * sine, np.cos(2 * psi), np.cos(3 * psi)]
+    columns = [ones, np.cos(psi), -sine, -(slope - slope.mean()) * sine, *(np.cos(k * psi) for k in (2, 3, 4))]
     return _Template("sin", np.stack(columns), ones.astype(bool))
 
 

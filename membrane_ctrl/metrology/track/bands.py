@@ -14,6 +14,9 @@ _LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
 # Power over the median around it and of all, of one frame and of the mean over some: bands have 100 and more. What
 # fringes and rounding leave has 10, and scatters from frame to frame.
 _CLEAR, _CLEAR_MEAN = 150.0, 25.0
+_CLEAR_FIRST = (
+    6.0  # of what five frames have begun (four tenths of a mean): weak bands, too, spoil the light they give
+)
 _KEEPS = 0.9  # share of the former frames in the mean
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
@@ -55,10 +58,17 @@ class Bands:
         means = power.reshape(-1, _FINER).mean(axis=1)
         around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
         clear = power / np.repeat(around, _FINER)
-        self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
-        clear = np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN)
         clear[: _LEAST_BANDS * _FINER] = 0.0
-        found_rad = 2 * np.pi * int(np.argmax(clear)) / size
+        self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
+        return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
+
+    def recall(self) -> bool:
+        """Whether the first frames show one more wave together."""
+        return self._add(self._mean / _CLEAR_FIRST)
+
+    def _add(self, clear: FloatArray) -> bool:
+        """Whether the clearest wave is one, by its power over what it must have, and was not known."""
+        found_rad = 2 * np.pi * int(np.argmax(clear)) / (_FINER * self._place.size)
         apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
         if len(apart) == _MOST or not apart.all() or np.max(clear) < 1:
             return False

@@ -116,6 +116,10 @@ class Tracker:
             seen.append(self._clear)
         if any(frame.verdict == "rejected" for frame in found):
             return found
+        if self._bands.recall():
+            self._begin(self._fitter.scene, self._last.surface, self._last.light)
+            self._last_time_s = math.nan  # time runs back
+            return self.anchor(frames, shifts_rad, time_s, displacement_um)
         shown = [(float(x), float(y)) for x, y in shifts_rad]
         errors_mm2 = np.diag(self._fitter.covariance_mm2(self._last, shown[-1], self._noise_adu))
         moved = self._renew(time_s, fits, [errors_mm2] * len(fits), np.stack(seen), shown)
