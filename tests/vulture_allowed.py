@@ -12,10 +12,9 @@ Camera  # the role that the camera drivers fill
 _.common_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
 _.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
-_.power_cycle, _.intrude, _.set_double  # faults that scenarios and tests bring about
+_.power_cycle, _.set_double  # faults that scenarios and tests bring about
 _.__signature__  # Typer reads a command's options from it
 _.expect  # of a scenario: its tests
-_.failing  # state of an outbox, which tests look at
 _.__init_subclass__  # Python calls it
 _.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
 _.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregularity_rms_um  # numbers of a figure,

@@ -42,13 +42,8 @@ class Outbox:
         self._send = send
         self._waiting: deque[Notice] = deque()
         self._due_s = 0.0
-        self._failures = 0
+        self.failures = 0  # since the last success
         self.dropped = 0
-
-    @property
-    def failing(self) -> bool:
-        """The last attempt failed."""
-        return self._failures > 0
 
     def post(self, notice: Notice) -> None:
         """Queue a notice."""
@@ -68,11 +63,11 @@ class Outbox:
             return
         while self._waiting:
             if not self._send(self._waiting[0]):
-                self._failures += 1
-                self._due_s = now_s + pause_s(self._failures, _AGAIN_S, _AGAIN_MOST_S)
+                self.failures += 1
+                self._due_s = now_s + pause_s(self.failures, _AGAIN_S, _AGAIN_MOST_S)
                 return
             self._waiting.popleft()
-            self._failures = 0
+            self.failures = 0
 
 
 _MISSING = "alarms.urls_file: Apprise is not installed; pip install 'membrane-ctrl[alarms]'"

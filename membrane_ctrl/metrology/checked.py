@@ -14,6 +14,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology import bins, motion, reconstruct
 from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
+from membrane_ctrl.metrology.frames.bands import without_bands
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.orders import gray_bit, orders
 from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, inside_pattern, mm_per_rad
@@ -95,7 +96,7 @@ def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | 
 
     `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets saturation.
     """
-    binned = frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
+    stack, binned = without_bands(stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1))
     try:
         found = _check(stack, binned, optics, anchor)
     except RejectedSetError as error:

@@ -182,8 +182,9 @@ def _axis_phases(
     # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
+    gain = None if stack.gain is None else stack.gain[used]
     return pixel_phases(
-        frames, stack.design(used), combined, index, sensitivity, reference, 2**optics.camera.bits - 1
+        frames, stack.design(used), combined, index, sensitivity, reference, 2**optics.camera.bits - 1, gain
     )
 
 

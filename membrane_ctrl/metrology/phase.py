@@ -251,37 +251,15 @@ CONTRAST_SHARE = 0.2
 FRINGE_SHARE = 0.1
 
 
-@dataclass(frozen=True)
 class FullSlots:
     """Positions of the images in the sequence of a full cycle."""
 
-    steps: int
-
-    @property
-    def sinusoids(self) -> tuple[slice, slice]:
-        """x and y."""
-        second = self.steps + GRAY_BITS
-        return slice(0, self.steps), slice(second, second + self.steps)
-
-    @property
-    def gray(self) -> tuple[slice, slice]:
-        """x and y."""
-        return tuple(slice(s.stop, s.stop + GRAY_BITS) for s in self.sinusoids)  # type: ignore[return-value]
-
-    @property
-    def white(self) -> int:
-        """Highest level."""
-        return 2 * (self.steps + GRAY_BITS)
-
-    @property
-    def black(self) -> int:
-        """Lowest level."""
-        return self.white + 1
-
-    @property
-    def count(self) -> int:
-        """All images."""
-        return self.black + 1
+    def __init__(self, steps: int) -> None:
+        second = steps + GRAY_BITS
+        self.steps, self.count = steps, 2 * second + 2
+        self.sinusoids = slice(0, steps), slice(second, second + steps)  # of x and y
+        self.gray = slice(steps, second), slice(second + steps, 2 * second)
+        self.white, self.black = 2 * second, 2 * second + 1  # highest and lowest level
 
 
 def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArray) -> FloatArray:

@@ -58,7 +58,7 @@ class VirtualBench:
         self.wrong = Wrong()
         self._sample = self._sampled(None)
         self.board = pump_board.BoardState(register_map.default_map(), self._sample)
-        self._driver = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
+        self._driver = PumpBoard("", watchdog_s=watchdog_s, link=MemoryLink(self))
 
     def advance(self, duration_s: float) -> None:
         """Let time pass: the plant moves, the board samples it, judges it and drives it."""
@@ -75,17 +75,6 @@ class VirtualBench:
             pump if math.isnan(wrong.pump_stuck_fraction) else wrong.pump_stuck_fraction,
             vent if math.isnan(wrong.vent_stuck_fraction) else wrong.vent_stuck_fraction,
         )
-
-    def intrude(self, pump_fraction: float, watchdog_s: float = 10.0) -> str:
-        """Another program claims the board, clears its faults and pumps; returns the refusal, or nothing."""
-        other = PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(self))
-        try:
-            at_once(other.open())
-            at_once(other.clear_faults(roles.ALL_FAULTS))
-            at_once(other.write(roles.BenchCommand(pump_fraction, 0.0)))
-        except roles.LinkError as error:
-            return str(error)
-        return ""
 
     def power_cycle(self) -> None:
         """The board restarts: outputs off, watchdog off, faults lost."""
@@ -137,7 +126,7 @@ class VirtualBench:
         )
 
 
-class _MemoryLink:
+class MemoryLink:
     """A `ModbusLink` that ends at a board in memory: requests take no time."""
 
     name = "virtual board"

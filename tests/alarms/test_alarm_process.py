@@ -157,12 +157,12 @@ def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
     for now_s in range(100):
         outbox.step(float(now_s))
     assert sender.tried == 4, "at 0, 10, 30 and 70 s"
-    assert outbox.failing
+    assert outbox.failures
     sender.down = False
     outbox.step(150.0)
     assert [notice.name for notice in sender.through] == [str(n) for n in range(10, 60)]
     assert outbox.empty
-    assert not outbox.failing
+    assert not outbox.failures
 
 
 def spec(telemetry: object, events: object) -> AlarmsSpec:

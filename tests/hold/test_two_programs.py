@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from firmware_iface import roles
+from firmware_iface.drivers.pump_board import PumpBoard
 from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
@@ -9,7 +11,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.virtual_bench import VirtualBench
+from membrane_ctrl.sim.virtual_bench import MemoryLink, VirtualBench, at_once
 
 CONFIG = Config(
     loop=LoopConfig(rate_hz=10.0),
@@ -44,6 +46,18 @@ class Story:
         self.bench.wrong.stalled = False
 
 
+def intrude(bench: VirtualBench, pump_fraction: float) -> str:
+    """Another program claims the board, clears its faults and pumps; returns the refusal, or nothing."""
+    other = PumpBoard("", watchdog_s=10.0, link=MemoryLink(bench))
+    try:
+        at_once(other.open())
+        at_once(other.clear_faults(roles.ALL_FAULTS))
+        at_once(other.write(roles.BenchCommand(pump_fraction, 0.0)))
+    except roles.LinkError as error:
+        return str(error)
+    return ""
+
+
 def faults(ticks: list[VirtualTick]) -> list[str]:
     return [event.name for tick in ticks for event in tick.events if isinstance(event, Fault)]
 
@@ -51,7 +65,7 @@ def faults(ticks: list[VirtualTick]) -> list[str]:
 def test_a_second_program_is_refused_as_long_as_the_hold_feeds_the_watchdog() -> None:
     story = Story()
     for _ in range(20):
-        assert "another program holds the board" in story.bench.intrude(1.0)
+        assert "another program holds the board" in intrude(story.bench, 1.0)
         (tick,) = story.go_on(0.1)
         assert (tick.row.state, tick.row.fault) == (State.HOLD, 0)
         assert story.bench.board.pump_fraction < 0.9
@@ -62,7 +76,7 @@ def test_a_second_program_is_refused_as_long_as_the_hold_feeds_the_watchdog() ->
 def test_a_hold_that_lost_its_board_sees_it_in_its_next_tick_and_never_takes_it_back() -> None:
     story = Story()
     story.stall(1.0)
-    assert story.bench.intrude(0.2) == ""
+    assert intrude(story.bench, 0.2) == ""
     (first,) = story.go_on(0.1)
     assert faults([first]) == ["board_taken"]
     assert first.outputs.command.pump_fraction == 0.0

@@ -14,10 +14,10 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.measure.measurement import Figures
+from membrane_ctrl.metrology.frames.bands import Bands
 from membrane_ctrl.metrology.full import FilmMotion
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface, sag_gradient
-from membrane_ctrl.metrology.track.bands import Bands
 from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, _split, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker

@@ -255,13 +255,14 @@ class CrossedWorld:
         pattern = {"steps": 4, "periods": PERIODS, "period_mm": self.side_mm / PERIODS}
         return {"schema": "membrane-capture/1", "kind": kind, "pattern": pattern}
 
-    def write_reference(self, folder: Path, t: float = 0.0) -> None:
-        """Write the 18 frames of a full set, the film at rest."""
+    def write_reference(self, folder: Path, t: float = 0.0, frame_s: float = 0.0) -> None:
+        """Write the 18 frames of a full set, one every `frame_s`; with 0 the film is at rest."""
         folder.mkdir(parents=True)
         rows = []
-        for name, row, pattern in _full(self.side_mm / PERIODS):
-            cv2.imwrite(str(folder / f"{name}.png"), self.frame(t, pattern))
-            rows.append({"file": f"{name}.png", **row, **self._laser(t)})
+        for k, (name, row, pattern) in enumerate(_full(self.side_mm / PERIODS)):
+            at_s = t + frame_s * k
+            cv2.imwrite(str(folder / f"{name}.png"), self.frame(at_s, pattern))
+            rows.append({"file": f"{name}.png", **row, **self._laser(at_s)})
         table = self._table("full")
         table["geometry"] = {"a_mm": self.a_mm, "b_mm": self.b_mm, "alpha_deg": self.alpha_deg}
         table["camera"] = {

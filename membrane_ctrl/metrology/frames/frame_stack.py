@@ -25,6 +25,7 @@ class FrameStack:
     unusable: dict[int, str]  # frames that hold no picture
     # (2, frames): level and swing of the light of each sinusoid about 1, where the frames' light is known to differ
     light: FloatArray | None = None
+    gain: FloatArray | None = None  # (frames, height): of the light of each row, where bands of a backlight are known
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
@@ -52,7 +53,8 @@ class FrameStack:
 
     def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
-        return replace(self, frames=self.frames[order], light=None)
+        gain = None if self.gain is None else self.gain[order]
+        return replace(self, frames=self.frames[order], light=None, gain=gain)
 
     @property
     def readings_um(self) -> FloatArray:
@@ -116,11 +118,12 @@ class PixelPhases:
 
 
 @kernel
-def _phases(frames, index, weights, design, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
+def _phases(frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
     """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced by the phase."""
-    steps = weights.shape[1]
+    steps, height = fade.shape
     for p in range(start, stop):
         place = index[p]
+        row = place // (frames.shape[1] // height)
         mean = 0.0
         c = 0.0
         s = 0.0
@@ -128,12 +131,13 @@ def _phases(frames, index, weights, design, turn, mirror, slope, reference, limi
         for k in range(steps):
             value = float(frames[k, place])
             top = max(top, value)
+            value *= fade[k, row]
             mean += weights[0, k] * value
             c += weights[1, k] * value
             s += weights[2, k] * value
         rest = 0.0
         for k in range(steps):
-            left = float(frames[k, place]) - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
+            left = float(frames[k, place]) * fade[k, row] - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
         c, s = still(c, s, slope[p], turn, mirror)
         wrapped = arctan2(s, c)
@@ -151,6 +155,7 @@ def pixel_phases(
     sensitivity_rad_per_um: FloatArray,
     reference_rad: FloatArray,
     full_scale_adu: int,
+    gain: FloatArray | None = None,
 ) -> PixelPhases:
     """Phases of one axis.
 
@@ -168,11 +173,14 @@ def pixel_phases(
         Change of phase per um of displacement; zeros if no motion is corrected.
     reference_rad : (n,) array
         Absolute phase to within half a period; not changed.
+    gain : (N, height) array, optional
+        Of the light of the rows of each frame.
     """
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
     out = np.empty((2, index.size), np.float32)
-    fixed = (np.linalg.pinv(design), design, combined.turn, combined.mirror)
+    fade = np.ones(frames.shape[:2]) if gain is None else 1 / gain
+    fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
         _phases(flat, index, *fixed, sensitivity_rad_per_um, phase, float(full_scale_adu), out, start, stop)

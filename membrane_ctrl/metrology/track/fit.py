@@ -19,10 +19,10 @@ from itertools import product
 
 import numpy as np
 
+from membrane_ctrl.metrology.frames.bands import Bands
 from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
-from membrane_ctrl.metrology.track.bands import Bands
 from membrane_ctrl.metrology.track.scene import CrossedScene, light_left, light_waves
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
 

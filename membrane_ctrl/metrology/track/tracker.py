@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from membrane_ctrl.metrology.frames.bands import Bands
 from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track import tracked
-from membrane_ctrl.metrology.track.bands import Bands
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame

@@ -1,0 +1,220 @@
+"""Bands that a pulsed backlight leaves in the rows of a rolling shutter.
+
+Each row sees another part of the pulses, so that the light of a picture is multiplied by waves along its rows. Their
+frequencies stay, their amplitudes and phases are others in each frame. Where bands are as wide as the fringes, a fit
+without them takes them for shape. What it leaves shows them elsewhere: a wave found there joins the fit's unknowns.
+
+`Bands` are those of frames of crossed fringes. `without_bands` finds them in the phase steps of a set: frame k shows
+g_k m_k, with the gain g_k = 1 + a_k w of its rows, of which level, swing and phase leave P (g m), P the projector off
+their columns. Least squares over the bins give a; the panel's harmonics and a moving film are unknowns, too.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
+from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+
+_LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
+# Power over the median around it and of all, of one frame and of the mean over some: bands have 100 and more. What
+# fringes and rounding leave has 10, and scatters from frame to frame.
+_CLEAR, _CLEAR_MEAN = 150.0, 25.0
+_CLEAR_FIRST = 6.0  # of four tenths of a mean, which five frames make: weak bands, too, spoil the light they give
+_KEEPS = 0.9  # share of the former frames in the mean
+_WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
+_MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
+_FINER = 16  # steps of the frequency in one over the picture's height
+_FEWEST_STEPS, _DARKEST = 4, 0.2  # of the light of a row
+_CLEAR_STEPS = 40.0  # power over that around it, in the mean over an axis' steps; without bands it is 10 at most
+_FEWEST_BINS, _ENOUGH_BINS = 1_000, 40_000  # fewer show nothing, more only cost time
+_TURNS = 3  # the last one changes the largest bands by a thousandth
+_SINGULAR = 1e-3  # share of the largest eigenvalue below which amplitudes are not determined, and stay
+_UNEXPLAINED = 0.05  # of bands, times the share that they leave of the rest: those of wrong pictures explain little
+
+
+class Bands:
+    """The waves along the rows that frames have shown.
+
+    Parameters
+    ----------
+    row : (n,) array
+        Of each bin.
+    """
+
+    def __init__(self, row: IntArray) -> None:
+        self.row = row
+        self._place = np.arange(int(row.max()) + 1) - row.mean()
+        self._rad_per_row = self._told = np.zeros(0)
+        self.waves = np.zeros((0, self._place.size), np.float32)  # (2 k, R): cosines, sines
+        self._steady, self._mean = np.ones(row.size, np.float32), np.zeros(self._place.size // 2 * _FINER)
+
+    def gain(self, amplitudes: FloatArray) -> Singles:
+        """What multiplies the light of each bin (n,)."""
+        return np.asarray(1 + amplitudes @ self.waves, np.float32)[self.row] if amplitudes.size else self._steady
+
+    def sums(self, values: Singles) -> FloatArray:
+        """Over each row (k, R), of values (k, n)."""
+        return np.stack([np.bincount(self.row, one, self._place.size) for one in values])
+
+    def solved(self, rows: FloatArray) -> FloatArray:
+        """Amplitudes (2 k,) from sums (2, R) of light times rest, and of light squared, of a fit without bands."""
+        return np.asarray(np.linalg.solve((self.waves * rows[1]) @ self.waves.T, self.waves @ rows[0]), float)
+
+    def search(self, rows: FloatArray) -> bool:
+        """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
+        clear = _clear(_power(rows[0]))
+        self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
+        return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
+
+    def recall(self) -> bool:
+        """Whether the first frames show one more wave together."""
+        return self._add(self._mean / _CLEAR_FIRST)
+
+    def _add(self, clear: FloatArray) -> bool:
+        """Whether the clearest wave is one, by its power over what it must have, and was not known."""
+        found_rad = 2 * np.pi * int(np.argmax(clear)) / (_FINER * self._place.size)
+        apart = np.abs(self._rad_per_row - found_rad) > 2 * np.pi * _WIDE / self._place.size
+        if len(apart) == _MOST or not apart.all() or np.max(clear) < 1:
+            return False
+        self._mean *= 0
+        self._rad_per_row, self._told = np.append(self._rad_per_row, found_rad), np.append(self._told, 0.0)
+        self._draw()
+        return True
+
+    def keep(self, count: int) -> None:
+        """Forget all waves but the first `count` of 2 k rows."""
+        self._rad_per_row, self._told = self._rad_per_row[: count // 2], self._told[: count // 2]
+        self._draw()
+
+    def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
+        """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""
+        (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
+        change = self._place * (across * cosine - along * sine)
+        self._told = self._told + change**2 @ rows[1]  # of all frames: where bands vanish, the frequency stays
+        self._rad_per_row = self._rad_per_row + change @ rows[0] / np.maximum(self._told, 1e-30)
+        self._draw()
+
+    def _draw(self) -> None:
+        self.waves = _waves(self._rad_per_row, self._place).astype(np.float32)
+
+
+def _power(rows: FloatArray) -> FloatArray:
+    """Of the frequencies along the rows (..., R)."""
+    return np.abs(np.fft.rfft(rows, _FINER * rows.shape[-1])[..., : rows.shape[-1] // 2 * _FINER]) ** 2
+
+
+def _clear(power: FloatArray) -> FloatArray:
+    """Power over the median around it and of all; 0 for waves that are too wide."""
+    means = power.reshape(-1, _FINER).mean(axis=1)
+    around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
+    clear = power / np.repeat(around, _FINER)
+    clear[: _LEAST_BANDS * _FINER] = 0.0
+    return np.asarray(clear)
+
+
+class _Steps:
+    """The phase steps of one axis in n bins, and the bands of the N frames."""
+
+    def __init__(self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray) -> None:
+        self.frames, (_, self._count, columns) = frames, binned.means.shape
+        self._row, self._shifts_rad = index // columns, stack.shifts_rad(frames)
+        self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
+        self._design, self._inverse = stack.design(frames), np.linalg.pinv(stack.design(frames))
+        self.amplitudes = np.zeros((len(frames), 0))  # (N, 2 k): of cosines, then of sines
+        self._fit(np.zeros((0, self._count)))
+        self._first = float(np.sum(self._rest**2))
+
+    def gain(self, waves: FloatArray) -> FloatArray:
+        """Of the light of each row (N, R)."""
+        return np.maximum(1 + self.amplitudes @ waves, _DARKEST)
+
+    def _fit(self, waves: FloatArray) -> None:
+        """Level and phasor of each bin, what they show, and what they leave, without bands."""
+        gain = self.gain(waves)[:, self._row]
+        self._parts = self._inverse @ (self._seen / gain)
+        self._shown = self._design @ self._parts
+        self._rest, self._lit = self._seen / gain - self._shown, self._shown / gain
+
+    def rows(self) -> FloatArray:
+        """Sums (N, R) over the rows of what is left, times the light."""
+        return np.stack([np.bincount(self._row, one, self._count) for one in self._rest * self._shown])
+
+    def unexplained(self) -> float:
+        """Largest amplitude, times the share that the bands leave of what was left without them."""
+        return float(np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first)
+
+    def along(self) -> float:
+        """1 if the fringes are along the rows, 0 if they cross them many times."""
+        rows = [np.bincount(self._row, one, self._count) for one in self._parts[1:]]
+        return float(np.sum(np.hypot(*rows)) / np.sum(np.hypot(*self._parts[1:])))
+
+    def solve(self, waves: FloatArray) -> None:
+        """Fit the amplitudes of waves (2 k, R) along the rows."""
+        count, off = len(self.frames), np.eye(len(self.frames)) - self._design @ self._inverse
+        self.amplitudes = np.zeros((count, len(waves)))
+        for _ in range(_TURNS):
+            self._fit(waves)
+            swing = np.hypot(*self._parts[1:])
+            psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
+            parts = [off[:, [k]] * (self._lit[k] * wave[self._row]) for k in range(count) for wave in waves]
+            parts += [off @ (swing * np.cos(n * psi_rad)) for n in (2, 3, 4)]  # the panel's harmonics
+            parts += [off[:, [k]] * (swing * np.sin(psi_rad[k])) for k in range(count)]  # a film that moves
+            columns = np.stack([part.ravel() for part in parts])
+            norms = np.linalg.norm(columns, axis=1)[:, None]
+            columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
+            solved = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
+            solved /= np.maximum(norms, 1e-6 * norms.max())[:, 0]
+            self.amplitudes += solved[: self.amplitudes.size].reshape(count, -1)
+        self._fit(waves)
+
+
+def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned]:
+    """A set with the gain of its rows known, and its bins without bands.
+
+    Unchanged where no bands are seen, and where an axis has three steps, which leave nothing that shows them.
+    """
+    axes = [[k for k in stack.sinusoids(axis) if k not in stack.unusable] for axis in AXES]
+    if min(map(len, axes)) < _FEWEST_STEPS or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS:
+        return stack, binned
+    steps, rows = [_Steps(stack, binned, one, index) for one in axes], np.arange(binned.means.shape[1])
+    rad_per_row = _search(steps, rows)
+    if not rad_per_row.size or max(one.unexplained() for one in steps) > _UNEXPLAINED:
+        return stack, binned
+    place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
+    gain, means = np.ones((len(stack.patterns), place.size)), binned.means.copy()
+    for one in steps:
+        gain[one.frames] = one.gain(_waves(rad_per_row, place))
+        means[one.frames] /= one.gain(_waves(rad_per_row, rows))[..., None].astype(np.float32)
+    return replace(stack, gain=gain), replace(binned, means=means)
+
+
+def _search(steps: list[_Steps], rows: IntArray) -> FloatArray:
+    """Frequencies (k,) of the bands, whose amplitudes the steps then have."""
+    across, rad_per_row = min(steps, key=_Steps.along), np.zeros(0)  # fringes along the rows look like bands
+    while len(rad_per_row) < _MOST:
+        power = _power(across.rows()).mean(axis=0)
+        clear = _clear(power)
+        peak = np.argmax(power * (np.abs(np.arange(clear.size) - np.argmax(clear)) <= _FINER))
+        found_rad = 2 * np.pi * int(peak) / (_FINER * rows.size)
+        if np.max(clear) < _CLEAR_STEPS or (np.abs(rad_per_row - found_rad) < 2 * np.pi * _WIDE / rows.size).any():
+            break
+        rad_per_row = np.append(rad_per_row, found_rad)
+        for one in steps:
+            one.solve(_waves(rad_per_row, rows))
+    return rad_per_row
+
+
+def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:
+    """Bins (n,), enough of those in which both axes swing and nothing is saturated."""
+    swing = np.minimum(*(np.ptp(binned.means[frames], axis=0) for frames in axes))
+    seen = (swing > CONTRAST_SHARE * np.percentile(swing, 95)) & ~binned.saturated[[*axes[0], *axes[1]]].any(axis=0)
+    return np.flatnonzero(seen)[:: max(1, np.count_nonzero(seen) // _ENOUGH_BINS)]
+
+
+def _waves(rad_per_row: FloatArray, place: FloatArray | IntArray) -> FloatArray:
+    """Cosines, then sines (2 k, rows) of k frequencies."""
+    turns = rad_per_row[:, None] * place
+    return np.concatenate([np.cos(turns), np.sin(turns)])
