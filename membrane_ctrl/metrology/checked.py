@@ -22,6 +22,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
+_BANDS = 0.05  # larger ones are removed, too, but a twentieth of what they do is left: 0.1 um of figure and more
 _MANY_BLAMED = 3
 # Below, the light is called even: it leaves 0.02 um in the figure, and a blurred set seems to differ by as much.
 _UNEVEN = 2e-3
@@ -62,10 +63,16 @@ class Checked:
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
-        """Verdict from the frames alone: "ok", or "degraded" with the treatment of bad ones."""
-        if not self.flags:
-            return "ok", ""
-        return "degraded", f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
+        """Verdict from the frames alone: "ok", or "degraded" with the reason."""
+        if self.flags:
+            return "degraded", f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
+        bands = 0.0 if self.stack.gain is None else float(np.abs(self.stack.gain - 1).max())
+        if bands > _BANDS:
+            return (
+                "degraded",
+                f"bands of {bands:.0%} of the light along the rows: expose for whole pulses of the screen",
+            )
+        return "ok", ""
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""

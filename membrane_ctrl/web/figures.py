@@ -111,12 +111,9 @@ def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed:
     from matplotlib import colormaps
     from PIL import Image
 
-    change = reference is not None and reference is not figure
-    height_um = (
-        shapes.difference_map_um(figure, reference)
-        if change and reference is not None
-        else shapes.height_map_mm(figure) * 1e3
-    )
+    height_um = shapes.height_map_mm(figure) * 1e3
+    if change := reference is not None and reference is not figure:
+        height_um = shapes.difference_map_um(figure, reference)
     left = shapes.without_terms(height_um, removed) if removed else height_um
     there = np.isfinite(left)
     values = left[there].astype(np.float64)

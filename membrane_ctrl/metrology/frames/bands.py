@@ -36,13 +36,7 @@ _UNEXPLAINED = 0.05  # of bands, times the share that they leave of the rest: th
 
 
 class Bands:
-    """The waves along the rows that frames have shown.
-
-    Parameters
-    ----------
-    row : (n,) array
-        Of each bin.
-    """
+    """The waves along the rows that frames have shown; `row` (n,) is that of each bin."""
 
     def __init__(self, row: IntArray) -> None:
         self.row = row
@@ -59,13 +53,9 @@ class Bands:
         """Over each row (k, R), of values (k, n)."""
         return np.stack([np.bincount(self.row, one, self._place.size) for one in values])
 
-    def solved(self, rows: FloatArray) -> FloatArray:
-        """Amplitudes (2 k,) from sums (2, R) of light times rest, and of light squared, of a fit without bands."""
-        return np.asarray(np.linalg.solve((self.waves * rows[1]) @ self.waves.T, self.waves @ rows[0]), float)
-
     def search(self, rows: FloatArray) -> bool:
         """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
-        clear = _clear(_power(rows[0]))
+        clear = _clear(_power(rows[0]), _LEAST_BANDS)
         self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
         return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
 
@@ -106,12 +96,17 @@ def _power(rows: FloatArray) -> FloatArray:
     return np.abs(np.fft.rfft(rows, _FINER * rows.shape[-1])[..., : rows.shape[-1] // 2 * _FINER]) ** 2
 
 
-def _clear(power: FloatArray) -> FloatArray:
+def solved(waves: FloatArray | Singles, rows: FloatArray) -> FloatArray:
+    """Amplitudes (2 k,) of waves (2 k, R) from sums (2, R) of light times rest, and of light squared."""
+    return np.asarray(np.linalg.solve((waves * rows[1]) @ waves.T, waves @ rows[0]), float)
+
+
+def _clear(power: FloatArray, least_bands: int) -> FloatArray:
     """Power over the median around it and of all; 0 for waves that are too wide."""
     means = power.reshape(-1, _FINER).mean(axis=1)
     around = np.maximum(ndimage.median_filter(means, 2 * _AROUND + 1), np.median(means) + 1e-30)
     clear = power / np.repeat(around, _FINER)
-    clear[: _LEAST_BANDS * _FINER] = 0.0
+    clear[: least_bands * _FINER] = 0.0
     return np.asarray(clear)
 
 
@@ -119,56 +114,66 @@ class _Steps:
     """The phase steps of one axis in n bins, and the bands of the N frames."""
 
     def __init__(self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray) -> None:
-        self.frames, (_, self._count, columns) = frames, binned.means.shape
-        self._row, self._shifts_rad = index // columns, stack.shifts_rad(frames)
+        self.frames, (_, rows, columns) = frames, binned.means.shape
+        self._row, self._rows, self._shifts_rad = index // columns, np.arange(rows), stack.shifts_rad(frames)
         self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
         self._design, self._inverse = stack.design(frames), np.linalg.pinv(stack.design(frames))
-        self.amplitudes = np.zeros((len(frames), 0))  # (N, 2 k): of cosines, then of sines
-        self._fit(np.zeros((0, self._count)))
-        self._first = float(np.sum(self._rest**2))
+        self.unexplained, self.rad_per_row, self.amplitudes = 0.0, np.zeros(0), np.zeros((len(frames), 0))
+        self._fit()
+        self._first = np.sum(self._rest**2)
 
-    def gain(self, waves: FloatArray) -> FloatArray:
-        """Of the light of each row (N, R)."""
-        return np.maximum(1 + self.amplitudes @ waves, _DARKEST)
+    def gain(self, place: FloatArray | IntArray) -> FloatArray:
+        """Of the light of rows (N, R)."""
+        return np.maximum(1 + self.amplitudes @ _waves(self.rad_per_row, place), _DARKEST)
 
-    def _fit(self, waves: FloatArray) -> None:
-        """Level and phasor of each bin, what they show, and what they leave, without bands."""
-        gain = self.gain(waves)[:, self._row]
+    def _fit(self) -> None:
+        """Level and phasor of each bin, what they show, and what they leave, without the bands."""
+        gain = self.gain(self._rows)[:, self._row]
         self._parts = self._inverse @ (self._seen / gain)
         self._shown = self._design @ self._parts
         self._rest, self._lit = self._seen / gain - self._shown, self._shown / gain
 
-    def rows(self) -> FloatArray:
-        """Sums (N, R) over the rows of what is left, times the light."""
-        return np.stack([np.bincount(self._row, one, self._count) for one in self._rest * self._shown])
+    def _sums(self, values: FloatArray) -> FloatArray:
+        """Over each row (N, R), of values (N, n)."""
+        return np.stack([np.bincount(self._row, one, self._rows.size) for one in values])
 
-    def unexplained(self) -> float:
-        """Largest amplitude, times the share that the bands leave of what was left without them."""
-        return float(np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first)
+    def left(self) -> FloatArray:
+        """Power of the frequencies along the rows in what the steps leave, weighed with their light."""
+        rest, light = self._sums(self._rest * self._shown), self._sums(self._shown**2)
+        flicker = rest.sum(axis=1, keepdims=True) / light.sum(axis=1, keepdims=True)
+        return np.asarray(_power(rest - flicker * light).mean(axis=0))
+
+    def brighter(self, other: "_Steps") -> FloatArray:
+        """Sums (2, R), as in `solved`, of the light by which the other axis differs."""
+        level, theirs = self._parts[0], other._parts[0]
+        theirs = theirs * (level @ level / (theirs @ level))
+        return self._sums(np.stack([level * (theirs - level), level**2]))
 
     def along(self) -> float:
         """1 if the fringes are along the rows, 0 if they cross them many times."""
-        rows = [np.bincount(self._row, one, self._count) for one in self._parts[1:]]
-        return float(np.sum(np.hypot(*rows)) / np.sum(np.hypot(*self._parts[1:])))
+        return float(np.sum(np.hypot(*self._sums(self._parts[1:]))) / np.sum(np.hypot(*self._parts[1:])))
 
-    def solve(self, waves: FloatArray) -> None:
-        """Fit the amplitudes of waves (2 k, R) along the rows."""
-        count, off = len(self.frames), np.eye(len(self.frames)) - self._design @ self._inverse
-        self.amplitudes = np.zeros((count, len(waves)))
+    def solve(self, rad_per_row: FloatArray) -> None:
+        """Fit the amplitudes of waves along the rows."""
+        count, waves = len(self.frames), _waves(rad_per_row, self._rows)
+        off = np.eye(count) - self._design @ self._inverse
+        self.rad_per_row, self.amplitudes = rad_per_row, np.zeros((count, len(waves)))
         for _ in range(_TURNS):
-            self._fit(waves)
+            self._fit()
             swing = np.hypot(*self._parts[1:])
             psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
             parts = [off[:, [k]] * (self._lit[k] * wave[self._row]) for k in range(count) for wave in waves]
             parts += [off @ (swing * np.cos(n * psi_rad)) for n in (2, 3, 4)]  # the panel's harmonics
-            parts += [off[:, [k]] * (swing * np.sin(psi_rad[k])) for k in range(count)]  # a film that moves
+            for k in range(count):  # a film that moves, a lamp that flickers
+                parts += [off[:, [k]] * (swing * np.sin(psi_rad[k])), off[:, [k]] * self._lit[k]]
             columns = np.stack([part.ravel() for part in parts])
             norms = np.linalg.norm(columns, axis=1)[:, None]
             columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
             solved = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
             solved /= np.maximum(norms, 1e-6 * norms.max())[:, 0]
             self.amplitudes += solved[: self.amplitudes.size].reshape(count, -1)
-        self._fit(waves)
+        self._fit()
+        self.unexplained = float(np.abs(self.amplitudes).max() * np.sum(self._rest**2) / self._first)
 
 
 def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned]:
@@ -179,32 +184,29 @@ def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned
     axes = [[k for k in stack.sinusoids(axis) if k not in stack.unusable] for axis in AXES]
     if min(map(len, axes)) < _FEWEST_STEPS or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS:
         return stack, binned
-    steps, rows = [_Steps(stack, binned, one, index) for one in axes], np.arange(binned.means.shape[1])
-    rad_per_row = _search(steps, rows)
-    if not rad_per_row.size or max(one.unexplained() for one in steps) > _UNEXPLAINED:
+    x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
+    across, rows = min(steps, key=_Steps.along), np.arange(binned.means.shape[1])  # others look like bands
+    while (found := _more(across.rad_per_row, across.left(), rows)).size > across.rad_per_row.size:
+        for one in steps:
+            one.solve(found)
+    if not found.size or max(one.unexplained for one in steps) > _UNEXPLAINED:
         return stack, binned
+    y.amplitudes += solved(_waves(found, rows), x.brighter(y))  # in other light than x has, the film seems to move
     place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
     gain, means = np.ones((len(stack.patterns), place.size)), binned.means.copy()
     for one in steps:
-        gain[one.frames] = one.gain(_waves(rad_per_row, place))
-        means[one.frames] /= one.gain(_waves(rad_per_row, rows))[..., None].astype(np.float32)
+        gain[one.frames] = one.gain(place)
+        means[one.frames] /= one.gain(rows)[..., None].astype(np.float32)
     return replace(stack, gain=gain), replace(binned, means=means)
 
 
-def _search(steps: list[_Steps], rows: IntArray) -> FloatArray:
-    """Frequencies (k,) of the bands, whose amplitudes the steps then have."""
-    across, rad_per_row = min(steps, key=_Steps.along), np.zeros(0)  # fringes along the rows look like bands
-    while len(rad_per_row) < _MOST:
-        power = _power(across.rows()).mean(axis=0)
-        clear = _clear(power)
-        peak = np.argmax(power * (np.abs(np.arange(clear.size) - np.argmax(clear)) <= _FINER))
-        found_rad = 2 * np.pi * int(peak) / (_FINER * rows.size)
-        if np.max(clear) < _CLEAR_STEPS or (np.abs(rad_per_row - found_rad) < 2 * np.pi * _WIDE / rows.size).any():
-            break
-        rad_per_row = np.append(rad_per_row, found_rad)
-        for one in steps:
-            one.solve(_waves(rad_per_row, rows))
-    return rad_per_row
+def _more(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -> FloatArray:
+    """Frequencies, with one more if the power shows a wave that is none of them."""
+    clear = _clear(power, 1)
+    peak = np.argmax(power * (np.abs(np.arange(clear.size) - np.argmax(clear)) <= _FINER))
+    found_rad = 2 * np.pi * int(peak) / (_FINER * rows.size)
+    known = len(rad_per_row) == _MOST or (np.abs(rad_per_row - found_rad) < 2 * np.pi * _WIDE / rows.size).any()
+    return rad_per_row if known or np.max(clear) < _CLEAR_STEPS else np.append(rad_per_row, found_rad)
 
 
 def _with_fringes(binned: Binned, axes: list[list[int]]) -> IntArray:

@@ -19,7 +19,7 @@ from itertools import product
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.bands import Bands
+from membrane_ctrl.metrology.frames.bands import Bands, solved
 from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
@@ -58,9 +58,7 @@ class FrameFit:
     residual_adu: Singles  # (n,): light less the model's
     weights: Singles  # (n,): 1, falling to 0 for outliers
     converged: bool
-    bands: FloatArray = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (2 k,): relative amplitudes of the waves along the rows
+    bands: FloatArray = field(default_factory=lambda: np.zeros(0))  # (2 k,): relative amplitudes of the rows' waves
 
     @cached_property
     def scale_adu(self) -> float:
@@ -130,7 +128,7 @@ class FrameFitter:
         bands = np.zeros(len(self.bands.waves))
         if bands.size:  # each frame has others: without them, much would be an outlier at first
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, np.where(reach > 0, _ALL_ADU, 0.0))
-            bands = self.bands.solved(self.rows())
+            bands = solved(self.bands.waves, self.rows())
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
             if self._inverse is None:

@@ -24,9 +24,7 @@ from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
-_CELL = (
-    4  # bins along the side of a cell, over which what changes slowly is a plane: 1 % of the highest terms at the rim
-)
+_CELL = 4  # bins along a cell's side, over which what changes slowly is a plane: 1 % of the highest terms at the rim
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
@@ -48,9 +46,7 @@ _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 class Cells:
     """Squares of bins, or what is known of them, over each of which what changes slowly is a plane."""
 
-    places: tuple[
-        IntArray, Singles
-    ]  # cell (n,) of each bin, ascending; offset (2, n) from the mean of its cell's bins
+    places: tuple[IntArray, Singles]  # cell (n,) of each bin, ascending; offset (2, n) from the mean of its bins
     starts: IntArray  # (N,): first bins
 
     @staticmethod
