@@ -39,6 +39,7 @@ def stack_of(
     turned: bool = False,
     noise_adu: float = 1.0,
     shared: float = 0.0,
+    flicker: float = 0.0,
 ) -> FrameStack:
     """Steps of x, then of y, in 12 bits; bands, motion and noise of each frame, and `shared` bands of each axis."""
     random, frames, patterns = np.random.default_rng(7), [], []
@@ -48,6 +49,7 @@ def stack_of(
             shown = 0.5 + 0.5 * np.cos(psi)
             shown += bend * np.sin(np.pi * shown) ** 2
             gain = 1 + bands * np.cos(2 * np.pi * (bands_across * ROW / HEIGHT + random.random()))
+            gain *= 1 + flicker * random.normal()
             gain *= 1 + shared * np.sin(2 * np.pi * bands_across * ROW / HEIGHT + (axis == "y"))
             light = np.where(INSIDE, 200 + 3000 * (1 - 0.2 * COLUMN / WIDTH) * shown * gain, 20.0)
             frames.append(np.rint(light + random.normal(0, noise_adu, light.shape)).astype(np.uint16))
@@ -79,6 +81,7 @@ def slow_error_rad(stack: FrameStack, gain: Array | None, turned: bool = False) 
         ({"steps": 8}, False, 0.3),
         ({"bands_across": 2.0}, False, 0.25),
         ({"bend": 0.05}, False, 0.25),
+        ({"bend": 0.1, "bands": 0.004}, False, 0.4),
         ({"bend": 0.05, "motion_rad": 0.003}, False, 0.3),
     ],
 )
@@ -102,11 +105,12 @@ def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: f
         {"bands": 0.0, "motion_rad": 0.3, "turned": True},
         {"bands": 0.0, "noise_adu": 60.0},
         {"bands": 0.0, "shared": 0.02},
+        {"bands": 0.0, "flicker": 0.02},
         {"steps": 3},
     ],
 )
 def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None:
-    """Fringes of a bent panel and a film that moved, noise, wide light, and what three steps cannot tell."""
+    """Fringes of a bent panel and a film that moved, noise, a lamp that flickers, and what three steps cannot tell."""
     stack = stack_of(**change)  # type: ignore[arg-type]
     binned = bin_frames(stack, 4095)
     found, same = without_bands(stack, binned)

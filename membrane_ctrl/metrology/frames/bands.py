@@ -28,7 +28,7 @@ _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where th
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
 _FINER = 16  # steps of the frequency in one over the picture's height
 _FEWEST_STEPS, _DARKEST = 4, 0.2  # of the light of a row
-_CLEAR_STEPS = 40.0  # power over that around it, in the mean over an axis' steps; without bands it is 10 at most
+_CLEAR_STEPS = 20.0  # power over that around it, in the mean over an axis' steps; without bands it is 10 at most
 _FEWEST_BINS, _ENOUGH_BINS = 1_000, 40_000  # fewer show nothing, more only cost time
 _TURNS = 3  # the last one changes the largest bands by a thousandth
 _SINGULAR = 1e-3  # share of the largest eigenvalue below which amplitudes are not determined, and stay
@@ -121,6 +121,7 @@ class _Steps:
         self.unexplained, self.rad_per_row, self.amplitudes = 0.0, np.zeros(0), np.zeros((len(frames), 0))
         self._fit()
         self._first = np.sum(self._rest**2)
+        self.solve(self.rad_per_row)
 
     def gain(self, place: FloatArray | IntArray) -> FloatArray:
         """Of the light of rows (N, R)."""
@@ -139,9 +140,7 @@ class _Steps:
 
     def left(self) -> FloatArray:
         """Power of the frequencies along the rows in what the steps leave, weighed with their light."""
-        rest, light = self._sums(self._rest * self._shown), self._sums(self._shown**2)
-        flicker = rest.sum(axis=1, keepdims=True) / light.sum(axis=1, keepdims=True)
-        return np.asarray(_power(rest - flicker * light).mean(axis=0))
+        return np.asarray(_power(self._sums((self._rest - self._others) * self._shown)).mean(axis=0))
 
     def brighter(self, other: "_Steps") -> FloatArray:
         """Sums (2, R), as in `solved`, of the light by which the other axis differs."""
@@ -154,11 +153,11 @@ class _Steps:
         return float(np.sum(np.hypot(*self._sums(self._parts[1:]))) / np.sum(np.hypot(*self._parts[1:])))
 
     def solve(self, rad_per_row: FloatArray) -> None:
-        """Fit the amplitudes of waves along the rows."""
+        """Fit the amplitudes of waves along the rows, and what is no wave but may look like one."""
         count, waves = len(self.frames), _waves(rad_per_row, self._rows)
         off = np.eye(count) - self._design @ self._inverse
         self.rad_per_row, self.amplitudes = rad_per_row, np.zeros((count, len(waves)))
-        for _ in range(_TURNS):
+        for _ in range(_TURNS if len(waves) else 1):
             self._fit()
             swing = np.hypot(*self._parts[1:])
             psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
@@ -170,10 +169,11 @@ class _Steps:
             norms = np.linalg.norm(columns, axis=1)[:, None]
             columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
             solved = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
-            solved /= np.maximum(norms, 1e-6 * norms.max())[:, 0]
-            self.amplitudes += solved[: self.amplitudes.size].reshape(count, -1)
+            mine, others = np.split(solved, [self.amplitudes.size])
+            self.amplitudes += (mine / np.maximum(norms, 1e-6 * norms.max())[: mine.size, 0]).reshape(count, -1)
+            self._others = (others @ columns[mine.size :]).reshape(count, -1)
         self._fit()
-        self.unexplained = float(np.abs(self.amplitudes).max() * np.sum(self._rest**2) / self._first)
+        self.unexplained = float(np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first)
 
 
 def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned]:
