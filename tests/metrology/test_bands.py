@@ -110,7 +110,7 @@ def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: f
     ],
 )
 def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None:
-    """Fringes of a bent panel and a film that moved, noise, a lamp that flickers, and what three steps cannot tell."""
+    """Fringes of a bent panel and of a film that moved, noise, a lamp that flickers; three steps cannot tell."""
     stack = stack_of(**change)  # type: ignore[arg-type]
     binned = bin_frames(stack, 4095)
     found, same = without_bands(stack, binned)
