@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Pattern
 from membrane_ctrl.cli import run
 from membrane_ctrl.metrology.frames.bands import without_bands
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack, bin_frames
+from membrane_ctrl.metrology.frames.frame_stack import FrameStack, bin_frames, pixel_phases
+from membrane_ctrl.metrology.motion import combine_steps
 from tests.support.crossed_world import CrossedWorld
 from tests.support.tracked_errors import CLEAN, SIZE
 
@@ -118,13 +120,52 @@ def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None
     assert same is binned
 
 
-def test_both_axes_have_the_same_light_afterwards() -> None:
+@pytest.mark.parametrize(("bands_across", "flicker"), [(15.0, 0.0), (1.5, 0.01)])
+def test_both_axes_have_the_same_light_afterwards(bands_across: float, flicker: float) -> None:
     """What all steps of an axis share bends no phase, but in the light of the other axis the film seems to move."""
-    stack = stack_of(bands=0.01, shared=0.02)
+    stack = stack_of(bands=0.01, shared=0.02, bands_across=bands_across, flicker=flicker)
     _, binned = without_bands(stack, bin_frames(stack, 4095))
     x, y = binned.means[:4].mean(axis=0), binned.means[4:].mean(axis=0)
     apart = [np.median((y / x)[row][INSIDE[row]]) for row in range(20, 236)]
     assert np.std(apart) < 2e-3
+
+
+def test_bands_are_those_of_the_pixels_rows() -> None:
+    """Bins of 4 x 4 pixels, whose middles are between two pixels."""
+    stack = stack_of(bands=0.02)
+    frames = stack.frames.repeat(4, axis=1).repeat(4, axis=2)
+    row = (np.arange(4 * HEIGHT) + 0.5) / 4 - 0.5
+    turns = 15 * (row - ROW[:, 0].repeat(4)) / HEIGHT
+    assert np.abs(turns).max() < 0.03  # the bands of a large pixel are those of its rows
+    fine = replace(stack, frames=frames)
+    found, binned = without_bands(fine, bin_frames(fine, 4095))
+    assert binned.bin_px == 4
+    assert found.gain is not None
+    coarse = without_bands(stack, bin_frames(stack, 4095))[0].gain
+    expected = np.array([np.interp(row, ROW[:, 0], one) for one in np.asarray(coarse)])
+    np.testing.assert_allclose(found.gain[:, 8:-8], expected[:, 8:-8], atol=1e-3)
+
+
+def test_a_frame_without_a_picture_has_no_part_in_the_bands() -> None:
+    stack = stack_of(steps=5)
+    stack.frames[1] = 0
+    stack = replace(stack, unusable={1: "unreadable"})
+    found, _ = without_bands(stack, bin_frames(stack, 4095))
+    assert found.gain is not None
+    np.testing.assert_array_equal(found.gain[1], 1)
+    assert np.ptp(found.gain[[0, *range(2, 10)]], axis=1).min() > 0.01
+
+
+def test_pixels_are_measured_without_the_bands() -> None:
+    stack = stack_of(bands=0.02, noise_adu=0.0)
+    gain = without_bands(stack, bin_frames(stack, 4095))[0].gain
+    assert gain is not None
+    index, phase = np.flatnonzero(INSIDE), phases()[1]
+    still = combine_steps(stack.weights([4, 5, 6, 7]), stack.shifts_rad([4, 5, 6, 7]), 1)
+    fixed = stack.design([4, 5, 6, 7]), still, index, np.zeros(index.size), phase[INSIDE], 4095
+    seen, bare = pixel_phases(stack.frames[4:], *fixed, gain[4:]), pixel_phases(stack.frames[4:], *fixed)
+    assert np.median(seen.rest_adu) < 0.25 * np.median(bare.rest_adu)
+    assert np.std(seen.phase_rad - phase[INSIDE]) < 0.5 * np.std(bare.phase_rad - phase[INSIDE])
 
 
 @pytest.mark.parametrize("turned", [False, True])

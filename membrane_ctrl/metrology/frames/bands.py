@@ -6,7 +6,7 @@ without them takes them for shape. What it leaves shows them elsewhere: a wave f
 
 `Bands` are those of frames of crossed fringes. `without_bands` finds them in the phase steps of a set: frame k shows
 g_k m_k, with the gain g_k = 1 + a_k w of its rows, of which level, swing and phase leave P (g m), P the projector off
-their columns. Least squares over the bins give a; the panel's harmonics and a moving film are unknowns, too.
+their columns. Least squares over the bins give a; the panel's harmonics and a flickering lamp are unknowns, too.
 """
 
 from dataclasses import replace
@@ -163,8 +163,7 @@ class _Steps:
             psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
             parts = [off[:, [k]] * (self._lit[k] * wave[self._row]) for k in range(count) for wave in waves]
             parts += [off @ (swing * np.cos(n * psi_rad)) for n in (2, 3, 4)]  # the panel's harmonics
-            for k in range(count):  # a film that moves, a lamp that flickers
-                parts += [off[:, [k]] * (swing * np.sin(psi_rad[k])), off[:, [k]] * self._lit[k]]
+            parts += [off[:, [k]] * self._lit[k] for k in range(count)]  # a lamp that flickers
             columns = np.stack([part.ravel() for part in parts])
             norms = np.linalg.norm(columns, axis=1)[:, None]
             columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
