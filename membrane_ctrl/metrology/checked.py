@@ -70,7 +70,7 @@ class Checked:
         if bands > _BANDS:
             return (
                 "degraded",
-                f"bands of {bands:.0%} of the light along the rows: expose for whole pulses of the screen",
+                f"bands of {bands:.0%} of the light along the rows: expose for whole pulses of the backlight",
             )
         return "ok", ""
 
