@@ -27,7 +27,7 @@ _KEEPS = 0.9  # share of the former frames in the mean
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged
 _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmonics
 _FINER = 16  # steps of the frequency in one over the picture's height
-_FEWEST_STEPS, _DARKEST = 4, 0.2  # of the light of a row
+_FEWEST_STEPS, _DARKEST = 4, 0.2  # three leave nothing; no row is darker, over its mean
 _CLEAR_STEPS = 20.0  # power over that around it, in the mean over an axis' steps; without bands it is 10 at most
 _FEWEST_BINS, _ENOUGH_BINS = 1_000, 40_000  # fewer show nothing, more only cost time
 _TURNS = 3  # the last one changes the largest bands by a thousandth
@@ -54,7 +54,7 @@ class Bands:
         return np.stack([np.bincount(self.row, one, self._place.size) for one in values])
 
     def search(self, rows: FloatArray) -> bool:
-        """Whether what a fit leaves shows one more wave; sums (2, R) as in `solved`, of a fit with all known ones."""
+        """Whether sums (2, R), as of `fitted_waves`, of a fit with all known waves show one more."""
         clear = _clear(_power(rows[0]), _LEAST_BANDS)
         self._mean = _KEEPS * self._mean + (1 - _KEEPS) * clear
         return self._add(np.maximum(clear / _CLEAR, self._mean / _CLEAR_MEAN))
@@ -80,7 +80,7 @@ class Bands:
         self._draw()
 
     def refine(self, rows: FloatArray, amplitudes: FloatArray) -> None:
-        """Turn the frequencies to what a fit leaves; sums (2, R) as in `solved`, of the fit with these amplitudes."""
+        """Turn the frequencies to what sums (2, R), as of `fitted_waves`, of the fit with these amplitudes show."""
         (cosine, sine), (along, across) = np.split(self.waves, 2), np.split(amplitudes[:, None], 2)
         change = self._place * (across * cosine - along * sine)
         self._told = self._told + change**2 @ rows[1]  # of all frames: where bands vanish, the frequency stays
@@ -96,7 +96,7 @@ def _power(rows: FloatArray) -> FloatArray:
     return np.abs(np.fft.rfft(rows, _FINER * rows.shape[-1])[..., : rows.shape[-1] // 2 * _FINER]) ** 2
 
 
-def solved(waves: FloatArray | Singles, rows: FloatArray) -> FloatArray:
+def fitted_waves(waves: FloatArray | Singles, rows: FloatArray) -> FloatArray:
     """Amplitudes (2 k,) of waves (2 k, R) from sums (2, R) of light times rest, and of light squared."""
     return np.asarray(np.linalg.solve((waves * rows[1]) @ waves.T, waves @ rows[0]), float)
 
@@ -120,7 +120,7 @@ class _Steps:
         self._design, self._inverse = stack.design(frames), np.linalg.pinv(stack.design(frames))
         self.unexplained, self.rad_per_row, self.amplitudes = 0.0, np.zeros(0), np.zeros((len(frames), 0))
         self._fit()
-        self._first = np.sum(self._rest**2)
+        self._first = max(float(np.sum(self._rest**2)), 1e-30)
         self.solve(self.rad_per_row)
 
     def gain(self, place: FloatArray | IntArray) -> FloatArray:
@@ -143,7 +143,7 @@ class _Steps:
         return np.asarray(_power(self._sums((self._rest - self._others) * self._shown)).mean(axis=0))
 
     def brighter(self, other: "_Steps") -> FloatArray:
-        """Sums (2, R), as in `solved`, of the light by which the other axis differs."""
+        """Sums (2, R), as in `fitted_waves`, of the light by which the other axis differs."""
         level, theirs = self._parts[0], other._parts[0]
         theirs = theirs * (level @ level / (theirs @ level))
         return self._sums(np.stack([level * (theirs - level), level**2]))
@@ -167,8 +167,8 @@ class _Steps:
             columns = np.stack([part.ravel() for part in parts])
             norms = np.linalg.norm(columns, axis=1)[:, None]
             columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
-            solved = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
-            mine, others = np.split(solved, [self.amplitudes.size])
+            found = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
+            mine, others = np.split(found, [self.amplitudes.size])
             self.amplitudes += (mine / np.maximum(norms, 1e-6 * norms.max())[: mine.size, 0]).reshape(count, -1)
             self._others = (others @ columns[mine.size :]).reshape(count, -1)
         self._fit()
@@ -184,13 +184,13 @@ def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned
     if min(map(len, axes)) < _FEWEST_STEPS or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS:
         return stack, binned
     x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
-    across, rows = min(steps, key=_Steps.along), np.arange(binned.means.shape[1])  # others look like bands
+    across, rows = min(steps, key=_Steps.along), np.arange(binned.means.shape[1])  # those along them look like bands
     while (found := _more(across.rad_per_row, across.left(), rows)).size > across.rad_per_row.size:
         for one in steps:
             one.solve(found)
     if not found.size or max(one.unexplained for one in steps) > _UNEXPLAINED:
         return stack, binned
-    y.amplitudes += solved(_waves(found, rows), x.brighter(y))  # in other light than x has, the film seems to move
+    y.amplitudes += fitted_waves(_waves(found, rows), x.brighter(y))  # else the film seems to move, see `evidence`
     place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
     gain, means = np.ones((len(stack.patterns), place.size)), binned.means.copy()
     for one in steps:

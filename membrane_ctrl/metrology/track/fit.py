@@ -19,7 +19,7 @@ from itertools import product
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.bands import Bands, solved
+from membrane_ctrl.metrology.frames.bands import Bands, fitted_waves
 from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
@@ -128,7 +128,7 @@ class FrameFitter:
         bands = np.zeros(len(self.bands.waves))
         if bands.size:  # each frame has others: without them, much would be an outlier at first
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, np.where(reach > 0, _ALL_ADU, 0.0))
-            bands = solved(self.bands.waves, self.rows())
+            bands = fitted_waves(self.bands.waves, self.rows())
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
             if self._inverse is None:
