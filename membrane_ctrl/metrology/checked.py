@@ -13,8 +13,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology import bins, motion, reconstruct
-from membrane_ctrl.metrology.frames import evidence, frame_stack, integrity
-from membrane_ctrl.metrology.frames.bands import without_bands
+from membrane_ctrl.metrology.frames import bands, evidence, frame_stack, integrity
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.orders import gray_bit, orders
 from membrane_ctrl.metrology.phase import AXES, centre_phase_rad, inside_pattern, mm_per_rad
@@ -22,7 +21,6 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
-_BANDS = 0.05  # larger ones are removed, too, but a twentieth of what they do is left: 0.1 um of figure and more
 _MANY_BLAMED = 3
 # Below, the light is called even: it leaves 0.02 um in the figure, and a blurred set seems to differ by as much.
 _UNEVEN = 2e-3
@@ -66,13 +64,8 @@ class Checked:
         """Verdict from the frames alone: "ok", or "degraded" with the reason."""
         if self.flags:
             return "degraded", f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
-        bands = 0.0 if self.stack.gain is None else float(np.abs(self.stack.gain - 1).max())
-        if bands > _BANDS:
-            return (
-                "degraded",
-                f"bands of {bands:.0%} of the light along the rows: expose for whole pulses of the backlight",
-            )
-        return "ok", ""
+        doubt = bands.doubt(self.stack.gain)
+        return ("degraded", doubt) if doubt else ("ok", "")
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""
@@ -103,7 +96,7 @@ def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | 
 
     `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets saturation.
     """
-    stack, binned = without_bands(stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1))
+    stack, binned, _ = bands.without_bands(stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1))
     try:
         found = _check(stack, binned, optics, anchor)
     except RejectedSetError as error:

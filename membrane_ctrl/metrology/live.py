@@ -13,6 +13,8 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
+from membrane_ctrl.metrology.frames import bands
+from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.optics import film_law, geometry, surface, zernike
 from membrane_ctrl.metrology.uncertainty import geometry_spread, live_errors
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
@@ -73,6 +75,9 @@ class LiveReconstructor:
         self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
         self._weights = [phase.step_weights(shifts) for shifts in self._shifts_rad]
         self._slots = phase.FullSlots(optics.pattern.steps)
+        told = zip(phase.fringe_sequence(optics.pattern), self._shifts_rad.ravel(), strict=True)
+        self._patterns = tuple(replace(pattern, shift_rad=float(shift)) for pattern, shift in told)
+        self._bands_rad, self._doubt = np.zeros(0), ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = phasor.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
@@ -106,6 +111,7 @@ class LiveReconstructor:
             self._reference_um = float(readings[np.isfinite(readings)][0])
         self._binner.clear()
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
+        self._take_bands(np.zeros(0))
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
         phase_rad = phase.decode_full(images, optics.pattern, self._shifts_rad)
@@ -130,6 +136,8 @@ class LiveReconstructor:
             return rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
         self._binner.clear()
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
+        if self._bands_rad.size:
+            self._take_bands(self._bands_rad)
         return self._follow("fringes", self._tracked, times, readings)
 
     def prepare(self) -> None:
@@ -199,6 +207,18 @@ class LiveReconstructor:
             self._tracked = state
         return estimate
 
+    def _take_bands(self, known: FloatArray) -> None:
+        """Take bands of the backlight out of the sums; fringes-only cycles have those of the full one."""
+        slots = np.r_[self._slots.sinusoids]
+        means = (self._binner.sums[slots] / self._bin_px**2).astype(np.float32)
+        binned = Binned(self._bin_px, means, np.broadcast_to(self._binner.saturated > 0, means.shape))
+        none = np.empty((len(slots), self._optics.camera.height_px, 0), np.uint8)  # the bins are enough
+        stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
+        stack, binned, found = bands.without_bands(stack, binned, known)
+        self._bands_rad, self._doubt = found if not known.size else known, bands.doubt(stack.gain)
+        if found.size:
+            self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
+
     def _sums(self) -> list[AnyArray]:
         """Bin sums (N, bins) of the sinusoids of x and of y."""
         return [self._binner.sums[slots].reshape(self._slots.steps, -1) for slots in self._slots.sinusoids]
@@ -244,6 +264,8 @@ class LiveReconstructor:
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
         verdict, reason = judge(quality)
+        if verdict == "ok" and self._doubt:
+            verdict, reason = "degraded", self._doubt
         return ShapeEstimate(
             time_s=_finite_mean(times),
             kind=kind,

@@ -89,7 +89,7 @@ def slow_error_rad(stack: FrameStack, gain: Array | None, turned: bool = False) 
 )
 def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: float) -> None:
     stack = stack_of(turned=turned, **change)  # type: ignore[arg-type]
-    found, binned = without_bands(stack, bin_frames(stack, 4095))
+    found, binned, _ = without_bands(stack, bin_frames(stack, 4095))
     assert found.gain is not None
     before, after = (slow_error_rad(stack, gain, turned) for gain in (None, found.gain))
     assert after < share * before
@@ -115,7 +115,7 @@ def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None
     """Fringes of a bent panel and of a film that moved, noise, a lamp that flickers; three steps cannot tell."""
     stack = stack_of(**change)  # type: ignore[arg-type]
     binned = bin_frames(stack, 4095)
-    found, same = without_bands(stack, binned)
+    found, same, _ = without_bands(stack, binned)
     assert found.gain is None
     assert same is binned
 
@@ -124,7 +124,7 @@ def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None
 def test_both_axes_have_the_same_light_afterwards(bands_across: float, flicker: float) -> None:
     """What all steps of an axis share bends no phase, but in the light of the other axis the film seems to move."""
     stack = stack_of(bands=0.01, shared=0.02, bands_across=bands_across, flicker=flicker)
-    _, binned = without_bands(stack, bin_frames(stack, 4095))
+    _, binned, _ = without_bands(stack, bin_frames(stack, 4095))
     x, y = binned.means[:4].mean(axis=0), binned.means[4:].mean(axis=0)
     apart = [np.median((y / x)[row][INSIDE[row]]) for row in range(20, 236)]
     assert np.std(apart) < 2e-3
@@ -138,7 +138,7 @@ def test_bands_are_those_of_the_pixels_rows() -> None:
     turns = 15 * (row - ROW[:, 0].repeat(4)) / HEIGHT
     assert np.abs(turns).max() < 0.03  # the bands of a large pixel are those of its rows
     fine = replace(stack, frames=frames)
-    found, binned = without_bands(fine, bin_frames(fine, 4095))
+    found, binned, _ = without_bands(fine, bin_frames(fine, 4095))
     assert binned.bin_px == 4
     assert found.gain is not None
     coarse = without_bands(stack, bin_frames(stack, 4095))[0].gain
@@ -150,7 +150,7 @@ def test_a_frame_without_a_picture_has_no_part_in_the_bands() -> None:
     stack = stack_of(steps=5)
     stack.frames[1] = 0
     stack = replace(stack, unusable={1: "unreadable"})
-    found, _ = without_bands(stack, bin_frames(stack, 4095))
+    found, *_ = without_bands(stack, bin_frames(stack, 4095))
     assert found.gain is not None
     np.testing.assert_array_equal(found.gain[1], 1)
     assert np.ptp(found.gain[[0, *range(2, 10)]], axis=1).min() > 0.01
@@ -187,7 +187,7 @@ def test_wrong_pictures_are_no_bands(fault: str, turned: bool) -> None:
 
 def test_the_gain_goes_with_the_picture() -> None:
     stack = stack_of()
-    found, _ = without_bands(stack, bin_frames(stack, 4095))
+    found, *_ = without_bands(stack, bin_frames(stack, 4095))
     order = [1, 0, *range(2, 8)]
     assert found.gain is not None
     moved = found.reordered(order).gain
@@ -206,7 +206,10 @@ def measured(world: CrossedWorld, folder: Path) -> tuple[Array, str]:
 
 @pytest.mark.parametrize(
     ("pulses_hz", "rolling_s", "most_um", "said"),
-    [(1923.0, 16 / 1923.0, 0.05, ""), (130.0, 0.13, 0.25, "% of the light along the rows: expose for whole pulses")],
+    [
+        (1923.0, 16 / 1923.0, 0.05, ""),
+        (130.0, 0.13, 0.25, "% of the light along the rows: expose for whole backlight pulses"),
+    ],
 )
 def test_bands_bend_no_figure_of_a_full_set(
     tmp_path: Path, pulses_hz: float, rolling_s: float, most_um: float, said: str

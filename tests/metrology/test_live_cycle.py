@@ -373,6 +373,29 @@ def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
     assert np.median(np.abs(apart_um) / bar_um) > 0.2  # and not by a wide bar
 
 
+@pytest.mark.parametrize(("share", "most_um"), [(0.02, 0.05), (0.12, 0.3)])
+def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(share: float, most_um: float) -> None:
+    """They moved the figure by 0.3 and 1.6 um in cycles called ok; large ones are told."""
+    row, random = (
+        np.arange(float(OPTICS.camera.height_px))[:, None] / OPTICS.camera.height_px,
+        np.random.default_rng(3),
+    )
+
+    def banded(kind: str) -> tuple[Frames, np.ndarray, np.ndarray]:
+        frames, *rest = _render(kind)
+        gains = [1 + share * np.cos(2 * np.pi * (11.3 * row + turns)) for turns in random.random(len(frames))]
+        return [np.clip(np.rint(f * g), 0, 255).astype(np.uint8) for f, g in zip(frames, gains, strict=True)], *rest
+
+    still, live = _live(), LiveReconstructor(OPTICS, 1)
+    steady = still.fringes(*_render("fringes"))
+    for kind in ("full", "fringes", "fringes"):
+        found = getattr(live, kind)(*banded(kind))
+        assert np.linalg.norm((found.coeffs_um - steady.coeffs_um)[3:]) < most_um
+        assert found.verdict == ("ok" if share < 0.05 else "degraded")
+        assert ("bands of 1" in found.reason) == (share > 0.05)
+    assert live.fringes(*_render("fringes")).verdict == "ok"  # steady again
+
+
 def test_a_noisy_laser_is_in_the_bar() -> None:
     """Readings with 1 um of noise turn x against y: astigmatism of 0.1 um, fifty times the noise of the pixels."""
     live = LiveReconstructor(OPTICS, 2, laser_noise_um=1.0)

@@ -32,6 +32,8 @@ _CLEAR_STEPS = 20.0  # power over that around it, in the mean over an axis' step
 _FEWEST_BINS, _ENOUGH_BINS = 1_000, 40_000  # fewer show nothing, more only cost time
 _TURNS = 3  # the last one changes the largest bands by a thousandth
 _SINGULAR = 1e-3  # share of the largest eigenvalue below which amplitudes are not determined, and stay
+_NONE = np.zeros(0)
+_GREAT = 0.05  # a twentieth of what bands do is left: 0.1 um of figure from here on
 _UNEXPLAINED = 0.05  # of bands, times the share that they leave of the rest: those of wrong pictures explain little
 
 
@@ -113,15 +115,17 @@ def _clear(power: FloatArray, least_bands: int) -> FloatArray:
 class _Steps:
     """The phase steps of one axis in n bins, and the bands of the N frames."""
 
-    def __init__(self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray) -> None:
+    def __init__(
+        self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray, known: FloatArray
+    ) -> None:
         self.frames, (_, rows, columns) = frames, binned.means.shape
         self._row, self._rows, self._shifts_rad = index // columns, np.arange(rows), stack.shifts_rad(frames)
         self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
         self._design, self._inverse = stack.design(frames), np.linalg.pinv(stack.design(frames))
-        self.unexplained, self.rad_per_row, self.amplitudes = 0.0, np.zeros(0), np.zeros((len(frames), 0))
+        self.unexplained, self.rad_per_row, self.amplitudes = 0.0, _NONE, np.zeros((len(frames), 0))
         self._fit()
         self._first = max(float(np.sum(self._rest**2)), 1e-30)
-        self.solve(self.rad_per_row)
+        self.solve(known)
 
     def gain(self, place: FloatArray | IntArray) -> FloatArray:
         """Of the light of rows (N, R)."""
@@ -153,50 +157,61 @@ class _Steps:
         return float(np.sum(np.hypot(*self._sums(self._parts[1:]))) / np.sum(np.hypot(*self._parts[1:])))
 
     def solve(self, rad_per_row: FloatArray) -> None:
-        """Fit the amplitudes of waves along the rows, and what is no wave but may look like one."""
+        """Fit the amplitudes of waves along the rows, with the panel's harmonics and with lamps that flicker."""
         count, waves = len(self.frames), _waves(rad_per_row, self._rows)
-        off = np.eye(count) - self._design @ self._inverse
+        off, every = np.eye(count) - self._design @ self._inverse, np.vstack([waves, np.ones(self._rows.size)])
         self.rad_per_row, self.amplitudes = rad_per_row, np.zeros((count, len(waves)))
         for _ in range(_TURNS if len(waves) else 1):
             self._fit()
-            swing = np.hypot(*self._parts[1:])
             psi_rad = np.arctan2(self._parts[2], self._parts[1]) + self._shifts_rad[:, None]
-            parts = [off[:, [k]] * (self._lit[k] * wave[self._row]) for k in range(count) for wave in waves]
-            parts += [off @ (swing * np.cos(n * psi_rad)) for n in (2, 3, 4)]  # the panel's harmonics
-            parts += [off[:, [k]] * self._lit[k] for k in range(count)]  # a lamp that flickers
-            columns = np.stack([part.ravel() for part in parts])
-            norms = np.linalg.norm(columns, axis=1)[:, None]
-            columns /= np.maximum(norms, 1e-6 * norms.max())  # what vanishes is no unknown
-            found = np.linalg.pinv(columns @ columns.T, _SINGULAR, hermitian=True) @ (columns @ self._rest.ravel())
-            mine, others = np.split(found, [self.amplitudes.size])
-            self.amplitudes += (mine / np.maximum(norms, 1e-6 * norms.max())[: mine.size, 0]).reshape(count, -1)
-            self._others = (others @ columns[mine.size :]).reshape(count, -1)
+            bent = off @ np.stack([np.hypot(*self._parts[1:]) * np.cos(n * psi_rad) for n in (2, 3, 4)])  # (3, N, n)
+            both = np.array([off[k][:, None] * self._sums(self._lit[k] * self._lit) for k in range(count)])
+            matrix = np.einsum("jkr,pr,qr->jpkq", both, every, every).reshape(2 * (count * len(every),))
+            aside = np.array([self._sums(self._lit * one) @ every.T for one in (*bent, self._rest)]).reshape(4, -1)
+            flat = bent.reshape(3, -1)
+            matrix = np.block([[matrix, aside[:3].T], [aside[:3], flat @ flat.T]])
+            right = np.append(aside[3], flat @ self._rest.ravel())
+            scale = np.sqrt(np.maximum(np.diag(matrix), 1e-12 * np.diag(matrix).max()))  # what vanishes is no unknown
+            found = (
+                np.linalg.pinv(matrix / np.outer(scale, scale), _SINGULAR, hermitian=True) @ (right / scale) / scale
+            )
+            lamps = found[:-3].reshape(count, -1)
+            self.amplitudes += lamps[:, :-1]
+            self._others = off @ (lamps[:, -1:] * self._lit) + np.tensordot(found[-3:], bent, 1)
         self._fit()
         self.unexplained = float(np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first)
 
 
-def without_bands(stack: FrameStack, binned: Binned) -> tuple[FrameStack, Binned]:
-    """A set with the gain of its rows known, and its bins without bands.
+def without_bands(
+    stack: FrameStack, binned: Binned, known: FloatArray = _NONE
+) -> tuple[FrameStack, Binned, FloatArray]:
+    """A set with the gain of its rows known, its bins without bands, and the bands' frequencies, `known` the first.
 
     Unchanged where no bands are seen, and where an axis has three steps, which leave nothing that shows them.
     """
     axes = [[k for k in stack.sinusoids(axis) if k not in stack.unusable] for axis in AXES]
     if min(map(len, axes)) < _FEWEST_STEPS or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS:
-        return stack, binned
-    x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
+        return stack, binned, _NONE
+    x, y = steps = [_Steps(stack, binned, one, index, known) for one in axes]
     across, rows = min(steps, key=_Steps.along), np.arange(binned.means.shape[1])  # those along them look like bands
     while (found := _more(across.rad_per_row, across.left(), rows)).size > across.rad_per_row.size:
         for one in steps:
             one.solve(found)
     if not found.size or max(one.unexplained for one in steps) > _UNEXPLAINED:
-        return stack, binned
+        return stack, binned, _NONE
     y.amplitudes += fitted_waves(_waves(found, rows), x.brighter(y))  # else the film seems to move, see `evidence`
     place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
     gain, means = np.ones((len(stack.patterns), place.size)), binned.means.copy()
     for one in steps:
         gain[one.frames] = one.gain(place)
         means[one.frames] /= one.gain(rows)[..., None].astype(np.float32)
-    return replace(stack, gain=gain), replace(binned, means=means)
+    return replace(stack, gain=gain), replace(binned, means=means), found
+
+
+def doubt(gain: FloatArray | None) -> str:
+    """Why a set with such gains (frames, rows) is degraded; empty if it is not."""
+    most = 0.0 if gain is None else float(np.abs(gain - 1).max())
+    return f"bands of {most:.0%} of the light along the rows: expose for whole backlight pulses" * (most > _GREAT)
 
 
 def _more(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -> FloatArray:

@@ -67,17 +67,7 @@ class FrameFit:
 
 
 class FrameFitter:
-    """Fits frame after frame.
-
-    Parameters
-    ----------
-    scene : CrossedScene
-        What a frame must show.
-    bands : Bands
-        Of the rows.
-    jacobian : (2, 36, 3, N) array, optional
-        That of a fitter of another scene with the same bins and surface; made anew if not given.
-    """
+    """Fits frame after frame of a scene; a `jacobian` (2, 36, 3, N) of the same bins and surface need not be made."""
 
     def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
         self.scene, self.bands = scene, bands
@@ -94,16 +84,9 @@ class FrameFitter:
         self._response = scene.response.astype(np.float32)
 
     def fit(self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: FloatArray) -> FrameFit:
-        """Fit a frame from the last solution.
+        """Fit a frame, means `seen_adu` (n,) over the bins, from the last solution.
 
-        Parameters
-        ----------
-        seen_adu : (n,) array
-            Means over the bins.
-        shifts_rad : (float, float)
-            Phase steps of x and y.
-        reach_adu : (n,) array
-            Residual from which a bin has no weight; 0 leaves it out.
+        From a residual of `reach_adu` (n,) on a bin has no weight; 0 leaves it out.
         """
         if self._inverse is not None and len(self._inverse) != _UNKNOWNS + len(self.bands.waves):
             self._inverse = None

@@ -93,21 +93,10 @@ class Tracker:
     def anchor(
         self, frames: Sequence[Image], shifts_rad: FloatArray, time_s: FloatArray, displacement_um: FloatArray
     ) -> list[TrackedFrame]:
-        """Take light, swings and phases of each bin from steps of the pattern.
+        """Take light, swings and phases of each bin from five steps of the pattern or more; the film moves little.
 
-        Parameters
-        ----------
-        frames : five or more frames
-            Of a film that moves little.
-        shifts_rad : (frames, 2) array
-            Their phase steps of x and y.
-        time_s, displacement_um : (frames,) arrays
-            As in `follow`.
-
-        Returns
-        -------
-        list of TrackedFrame
-            Their figures; if one of them is rejected, the light remains that of the reference.
+        Frames, `shifts_rad` (frames, 2), `time_s` and `displacement_um` (frames,) are those of `follow`. Returns the
+        frames' figures; if one of them is rejected, the light remains that of the reference.
         """
         found, fits, seen = [], [], []
         for frame, (x, y), at_s, reading in zip(frames, shifts_rad, time_s, displacement_um, strict=True):
@@ -211,8 +200,7 @@ class Tracker:
 
         Parameters
         ----------
-        frame : (height, width) array
-            uint8 or uint16.
+        frame : (height, width) array, uint8 or uint16
         shifts_rad : (float, float)
             Phase steps of x and y.
         time_s : float
