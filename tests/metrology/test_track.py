@@ -102,6 +102,14 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
     assert (np.abs(change_um / frames[0].sigma_um)[[j - 1 for j in odd]] < 5 * math.sqrt(2)).all()
 
 
+@pytest.mark.parametrize(("noise_adu", "verdict"), [(0.1, "rejected"), (0.0, "ok")])
+def test_a_frame_again_is_frozen_unless_the_camera_has_no_noise(bench: Bench, noise_adu: float, verdict: str) -> None:
+    """With a tenth of a count a pixel in nine differs; below 0.2 counts a frozen camera was called ok."""
+    tracker, frame = Tracker(bench.scene, SIZE, 255, noise_adu), bench.frame()
+    assert tracker.follow(frame, STILL, 0.0).verdict == "ok"
+    assert tracker.follow(frame, STILL, 0.1).verdict == verdict
+
+
 def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
     tracker = bench.tracker()
     frames = [tracker.follow(bench.frame(um), STILL, 0.1 * k) for k, um in enumerate((0.0, 5.0))]

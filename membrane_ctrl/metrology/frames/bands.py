@@ -19,9 +19,9 @@ from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 _LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
-# Power over the median around it and of all, of one frame and of the mean over some: bands have 100 and more. What
-# fringes and rounding leave has 10, and scatters from frame to frame.
-_CLEAR, _CLEAR_MEAN = 150.0, 25.0
+# Power over the median around it and of all, of one frame and of the mean over some. Without bands it reaches 22 in a
+# thousand frames. Of bands as wide as the fringes a fit leaves little: 100 where figures were 13 sigma off.
+_CLEAR, _CLEAR_MEAN = 30.0, 25.0
 _CLEAR_FIRST = 6.0  # of four tenths of a mean, which five frames make: weak bands, too, spoil the light they give
 _KEEPS = 0.9  # share of the former frames in the mean
 _WIDE, _AROUND = 2, 10  # bands in the picture: a wave's own width, and where the power around it is judged

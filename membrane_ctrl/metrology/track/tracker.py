@@ -24,7 +24,7 @@ _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
-_BLIND_NOISE_ADU = 0.2  # with less noise, two frames of a still mirror may be the same
+_BLIND_NOISE_ADU = 0.01  # with less, frames of a still mirror may be the same; here a pixel in 90 differs
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
 _SIGMA_EVERY_S = 2.5  # errors change slowly, and the covariance costs as much as eight fits
 
