@@ -17,7 +17,7 @@ from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.virtual_bench import VirtualBench, _MemoryLink
+from membrane_ctrl.sim.virtual_bench import VirtualBench, MemoryLink
 
 _WORDS = 2**16
 
@@ -111,4 +111,4 @@ class OldBoard(Stage):
 
 def another_client(stage: Stage, watchdog_s: float = WATCHDOG_S) -> PumpBoard:
     """A driver of another program on the same board."""
-    return PumpBoard("", watchdog_s=watchdog_s, link=_MemoryLink(stage.bench))
+    return PumpBoard("", watchdog_s=watchdog_s, link=MemoryLink(stage.bench))
