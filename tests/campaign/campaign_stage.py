@@ -17,7 +17,7 @@ from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.virtual_bench import VirtualBench, MemoryLink
+from membrane_ctrl.sim.virtual_bench import MemoryLink, VirtualBench
 
 _WORDS = 2**16
 
