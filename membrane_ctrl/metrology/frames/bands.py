@@ -29,7 +29,7 @@ _MOST = 6  # waves: the power of pulses falls as the fourth power of their harmo
 _FINER = 16  # steps of the frequency in one over the picture's height
 _FEWEST_STEPS, _DARKEST = 4, 0.2  # three leave nothing; no row is darker, over its mean
 _CLEAR_STEPS = 20.0  # power over that around it, in the mean over an axis' steps; without bands it is 10 at most
-_FEWEST_BINS, _ENOUGH_BINS = 1_000, 40_000  # fewer show nothing, more only cost time
+_FEWEST_BINS, _ENOUGH_BINS = 1_000, 15_000  # fewer show nothing, more only cost time
 _TURNS = 3  # the last one changes the largest bands by a thousandth
 _SINGULAR = 1e-3  # share of the largest eigenvalue below which amplitudes are not determined, and stay
 _NONE = np.zeros(0)
@@ -115,9 +115,7 @@ def _clear(power: FloatArray, least_bands: int) -> FloatArray:
 class _Steps:
     """The phase steps of one axis in n bins, and the bands of the N frames."""
 
-    def __init__(
-        self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray, known: FloatArray
-    ) -> None:
+    def __init__(self, stack: FrameStack, binned: Binned, frames: list[int], index: IntArray) -> None:
         self.frames, (_, rows, columns) = frames, binned.means.shape
         self._row, self._rows, self._shifts_rad = index // columns, np.arange(rows), stack.shifts_rad(frames)
         self._seen = binned.means[frames].reshape(len(frames), -1)[:, index]
@@ -125,7 +123,6 @@ class _Steps:
         self.unexplained, self.rad_per_row, self.amplitudes = 0.0, _NONE, np.zeros((len(frames), 0))
         self._fit()
         self._first = max(float(np.sum(self._rest**2)), 1e-30)
-        self.solve(known)
 
     def gain(self, place: FloatArray | IntArray) -> FloatArray:
         """Of the light of rows (N, R)."""
@@ -156,8 +153,8 @@ class _Steps:
         """1 if the fringes are along the rows, 0 if they cross them many times."""
         return float(np.sum(np.hypot(*self._sums(self._parts[1:]))) / np.sum(np.hypot(*self._parts[1:])))
 
-    def solve(self, rad_per_row: FloatArray) -> None:
-        """Fit the amplitudes of waves along the rows, with the panel's harmonics and with lamps that flicker."""
+    def solve(self, rad_per_row: FloatArray) -> float:
+        """Fit the amplitudes of waves along the rows, with harmonics and flicker; returns `unexplained`."""
         count, waves = len(self.frames), _waves(rad_per_row, self._rows)
         off, every = np.eye(count) - self._design @ self._inverse, np.vstack([waves, np.ones(self._rows.size)])
         self.rad_per_row, self.amplitudes = rad_per_row, np.zeros((count, len(waves)))
@@ -180,6 +177,7 @@ class _Steps:
             self._others = off @ (lamps[:, -1:] * self._lit) + np.tensordot(found[-3:], bent, 1)
         self._fit()
         self.unexplained = float(np.abs(self.amplitudes).max(initial=0.0) * np.sum(self._rest**2) / self._first)
+        return self.unexplained
 
 
 def without_bands(
@@ -192,12 +190,12 @@ def without_bands(
     axes = [[k for k in stack.sinusoids(axis) if k not in stack.unusable] for axis in AXES]
     if min(map(len, axes)) < _FEWEST_STEPS or (index := _with_fringes(binned, axes)).size < _FEWEST_BINS:
         return stack, binned, _NONE
-    x, y = steps = [_Steps(stack, binned, one, index, known) for one in axes]
-    across, rows = min(steps, key=_Steps.along), np.arange(binned.means.shape[1])  # those along them look like bands
+    x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
+    (across, other), rows = sorted(steps, key=_Steps.along), np.arange(binned.means.shape[1])
+    across.solve(known)  # fringes along the rows look like bands
     while (found := _more(across.rad_per_row, across.left(), rows)).size > across.rad_per_row.size:
-        for one in steps:
-            one.solve(found)
-    if not found.size or max(one.unexplained for one in steps) > _UNEXPLAINED:
+        across.solve(found)
+    if not found.size or max(across.unexplained, other.solve(found)) > _UNEXPLAINED:
         return stack, binned, _NONE
     y.amplitudes += fitted_waves(_waves(found, rows), x.brighter(y))  # else the film seems to move, see `evidence`
     place = np.arange(stack.size_px[0]) / binned.bin_px - (1 - 1 / binned.bin_px) / 2
