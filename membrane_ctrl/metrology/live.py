@@ -216,7 +216,9 @@ class LiveReconstructor:
         stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
         stack, binned, found = bands.without_bands(stack, binned, known)
         self._bands_rad, self._doubt = found if not known.size else known, bands.doubt(stack.gain)
-        if found.size:
+        if known.size and not found.size:
+            self._doubt = "bands of the backlight could not be told from what else changed in this cycle"
+        elif found.size:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
     def _sums(self) -> list[AnyArray]:

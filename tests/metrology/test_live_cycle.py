@@ -16,6 +16,7 @@ from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
 from membrane_ctrl.metrology.calibrate.solve import general_form
+from membrane_ctrl.metrology.frames import bands
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
@@ -394,6 +395,16 @@ def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(sh
         assert found.verdict == ("ok" if share < 0.05 else "degraded")
         assert ("bands of 1" in found.reason) == (share > 0.05)
     assert live.fringes(*_render("fringes")).verdict == "ok"  # steady again
+
+
+def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They stayed in a cycle called ok."""
+    live = _live()
+    live._bands_rad = np.array([0.3])
+    monkeypatch.setattr(bands, "_UNEXPLAINED", -1.0)
+    found = live.fringes(*_render("fringes"))
+    assert (found.verdict, found.reason[:34]) == ("degraded", "bands of the backlight could not b")
+    assert live._bands_rad.size == 1  # looked for again in the next
 
 
 def test_a_noisy_laser_is_in_the_bar() -> None:
