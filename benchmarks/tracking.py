@@ -62,11 +62,13 @@ def run() -> list[Figure]:
 
 def _bound_um(scene: CrossedScene, noise_adu: float) -> float:
     """The least RMS error of terms 4 to 36 that frames of this noise allow, their light refitted."""
+    once = scene.taper > 0  # the others repeat a bin
     phases, jacobian = scene.phase_rad(scene.surface), scene.jacobian(scene.surface)
     level, swing_x, swing_y = scene.light_adu
     (cos_x, cos_y), (sin_x, sin_y) = np.cos(phases), np.sin(phases)
     shape: FloatArray = -swing_x * sin_x * jacobian[0] - swing_y * sin_y * jacobian[1]
     columns = np.concatenate([shape, *(scene.basis * wave for wave in (level, swing_x * cos_x, swing_y * cos_y))])
+    columns = columns[:, once]
     sigma_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
     covariance = sigma_adu**2 * np.linalg.inv(columns @ columns.T)
     return 1e3 * float(np.sqrt(np.trace(covariance[2 : PARAMETERS - 1, 2 : PARAMETERS - 1])))

@@ -48,6 +48,12 @@ def _fold_four(line, quarter, size):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _fold_two(line, out):  # type: ignore[no-untyped-def]
+    for b in range(out.size):
+        out[b] = np.uint32(line[2 * b]) + np.uint32(line[2 * b + 1])
+
+
+@kernel
 def _fold(line, bin_px, out):  # type: ignore[no-untyped-def]
     for b in range(out.size):
         total = np.uint32(0)
@@ -79,6 +85,9 @@ def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  #
             _fold_four(line[0], line[1], sums.shape[1])
             for b in range(sums.shape[1]):
                 sums[row, b] = line[1, b]
+        elif bin_px == 8:
+            _fold_four(line[0], line[1], 2 * sums.shape[1])
+            _fold_two(line[1], sums[row])
         else:
             _fold(line[0], bin_px, sums[row])
         if _peak(frame, first, last, width) >= full_scale:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
+from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
@@ -53,7 +54,7 @@ class Bands:
 
     def sums(self, values: Singles) -> FloatArray:
         """Over each row (k, R), of values (k, n)."""
-        return np.stack([np.bincount(self.row, one, self._place.size) for one in values])
+        return np.asarray(sums_by(self.row, values, self._place.size))
 
     def search(self, rows: FloatArray) -> bool:
         """Whether sums (2, R), as of `fitted_waves`, of a fit with all known waves show one more."""
@@ -137,7 +138,7 @@ class _Steps:
 
     def _sums(self, values: FloatArray) -> FloatArray:
         """Over each row (N, R), of values (N, n)."""
-        return np.stack([np.bincount(self._row, one, self._rows.size) for one in values])
+        return np.asarray(sums_by(self._row, values, self._rows.size))
 
     def left(self) -> FloatArray:
         """Power of the frequencies along the rows in what the steps leave, weighed with their light."""

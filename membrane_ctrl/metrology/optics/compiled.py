@@ -117,3 +117,13 @@ def multiply(table, rows):  # type: ignore[no-untyped-def]
                 for k in range(rows.shape[1]):
                     out[i, k] += factor * rows[j, k]
     return out
+
+
+@kernel
+def sums_by(number, values, count):  # type: ignore[no-untyped-def]
+    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below `count`."""
+    out = np.zeros((values.shape[0], count))
+    for k in range(values.shape[0]):
+        for p in range(number.size):
+            out[k, number[p]] += values[k, p]
+    return out

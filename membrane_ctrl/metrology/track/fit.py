@@ -21,6 +21,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.frames.bands import Bands, fitted_waves
 from membrane_ctrl.metrology.optics import kernels
+from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.metrology.track.scene import CrossedScene, light_left, light_waves
@@ -151,9 +152,9 @@ class FrameFitter:
 
     def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
         """What the kernels take a frame's light from."""
-        turn, (_, offset) = self._turned(shape, light), self._cells.places
+        turn, offset = self._turned(shape, light), self._cells.offset
         turn[:, 0] += np.array(shifts_rad, np.float32)[:, None]
-        return self._base, turn, self._light_adu, self._maps, self._cells.starts, offset, self._response
+        return self._base, turn, self._light_adu, self._maps, offset, self._response
 
     def _turned(self, shape: Surface, light: FloatArray) -> Singles:
         """Planes (2, 3, N) of a surface's phases beyond those of the one traced last; the maps follow the light."""
@@ -230,13 +231,13 @@ class FrameFitter:
         """
         place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
         low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
-        upper = np.sin(np.pi / 2 * np.clip(place - low[:, self._cells.places[0]], 0, 1)) ** 2
+        upper = np.sin(np.pi / 2 * np.clip(place - self._cells.each(low), 0, 1)) ** 2
         (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
         side = _BLOCKS + 2
         number, total = low[1] * side + low[0], np.zeros((len(slow), side**2))
         for share, on in ((left * below, 0), (right * below, 1), (left * above, side), (right * above, side + 1)):
             pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))
-            total += [np.bincount(number + on, row, side**2) for row in pull]
+            total += sums_by(number + on, pull, side**2)
         return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
 
     def period_um(self) -> FloatArray:

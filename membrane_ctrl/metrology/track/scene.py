@@ -7,6 +7,7 @@ bin, and shape that 36 terms cannot represent. Light and response of the panel a
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
@@ -15,16 +16,18 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, phase, reconstruct
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.optics.compiled import kernel, step
+from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.kernels import cos_sin
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import AnyArray, BoolArray, FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
-_CELL = 4  # bins along a cell's side, over which what changes slowly is a plane: 1 % of the highest terms at the rim
+_SIDE = 4  # bins along a cell's side, over which what changes slowly is a plane: 1 % of the highest terms at the rim
+_BINS, _CELLS = _SIDE**2, 64  # of a cell, and of a block of cells, whose nine rows fit the first cache
+_BLOCK = _BINS * _CELLS
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
@@ -44,38 +47,60 @@ _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 @dataclass(frozen=True)
 class Cells:
-    """Squares of bins, or what is known of them, over each of which what changes slowly is a plane."""
+    """Squares of bins, N of them, over each of which what changes slowly is a plane.
 
-    places: tuple[IntArray, Singles]  # cell (n,) of each bin, ascending; offset (2, n) from the mean of its bins
-    starts: IntArray  # (N,): first bins
+    64 cells are a block: their first bins, then their second ones, and so on, so that loops over a block use vector
+    units. A cell with fewer bins repeats one, as the last block repeats a cell; what is repeated counts once, because
+    its weight is 0 (`of`).
+    """
+
+    offset: Singles  # (N / 64, 2, 16, 64): of the bins, from the mean of their cell's
 
     @staticmethod
-    def of(index: IntArray, columns: int) -> "tuple[IntArray, Cells]":
-        """Bins (n,) in the order of their cells, and these."""
-        square = index // columns // _CELL * columns + index % columns // _CELL
+    def of(index: IntArray, columns: int) -> "tuple[IntArray, BoolArray, Cells]":
+        """Bins (n,) in the order of the cells, whether each counts, and the cells."""
+        square = index // columns // _SIDE * columns + index % columns // _SIDE
         order = np.argsort(square, kind="stable")
-        index, (_, starts, cell) = index[order], np.unique(square[order], return_index=True, return_inverse=True)
-        place = np.stack([index % columns, index // columns])
-        mean = np.stack([np.bincount(cell, row) for row in place]) / np.bincount(cell)
-        return index, Cells((cell, (place - mean[:, cell]).astype(np.float32)), starts)
+        _, starts, counts = np.unique(square[order], return_index=True, return_counts=True)
+        place = np.arange(_BINS)
+        bin_of = starts[:, None] + np.where(counts[:, None] > place, place, 0)
+        more = -len(starts) % _CELLS
+        blocks = np.pad(bin_of, ((0, more), (0, 0)), "edge").reshape(-1, _CELLS, _BINS).swapaxes(1, 2)
+        counted = np.pad(counts[:, None] > place, ((0, more), (0, 0))).reshape(-1, _CELLS, _BINS).swapaxes(1, 2)
+        index = index[order][blocks]
+        at = np.stack([index % columns, index // columns], axis=1)
+        offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
+        return index.ravel(), counted.ravel(), Cells(offset)
+
+    @cached_property
+    def _offsets(self) -> Singles:
+        """(2, n)."""
+        return self.offset.swapaxes(0, 1).reshape(2, -1)
 
     def sums(self, values: AnyArray) -> AnyArray:
         """Of the cells (..., N) of bins (..., n)."""
-        return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
+        lead, blocks = values.shape[:-1], len(self.offset)
+        return np.asarray(values.reshape(*lead, blocks, _BINS, _CELLS).sum(axis=-2).reshape(*lead, blocks * _CELLS))
 
     def moments(self, values: AnyArray) -> AnyArray:
         """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
-        return np.stack([self.sums(values), *(self.sums(values * one) for one in self.places[1])], axis=-2)
+        return np.stack([self.sums(values), *(self.sums(values * one) for one in self._offsets)], axis=-2)
+
+    def each(self, values: AnyArray) -> AnyArray:
+        """Of the bins (..., n) those of their cells (..., N)."""
+        lead, blocks = values.shape[:-1], len(self.offset)
+        repeated = np.repeat(values.reshape(*lead, blocks, 1, _CELLS), _BINS, axis=-2)
+        return repeated.reshape(*lead, blocks * _BLOCK)
 
     def spread(self, planes: AnyArray) -> AnyArray:
         """Values (..., n) of the bins on planes (..., 3, N) of the cells."""
-        cell, (u, v) = self.places
-        return np.asarray(planes[..., 0, cell] + planes[..., 1, cell] * u + planes[..., 2, cell] * v)
+        mean, along_u, along_v = self.each(np.moveaxis(planes, -2, 0))
+        u, v = self._offsets
+        return np.asarray(mean + along_u * u + along_v * v)
 
     def planes(self, values: AnyArray) -> Singles:
         """The planes (..., 3, N) that fit values of bins (..., n) best."""
-        offset = self.places[1]
-        weights = self.moments(np.stack([np.ones_like(offset[0]), *offset]))
+        weights = self.moments(np.stack([np.ones_like(self._offsets[0]), *self._offsets]))
         weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
         inverse = np.linalg.inv(weights.transpose(2, 0, 1))
         return np.asarray(np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32, order="C")
@@ -132,69 +157,122 @@ class CrossedScene:
         return np.asarray(2 * self.light_adu[1:].sum(axis=0) * bent)
 
 
-@step
-def _waves(base, turn, light, maps, offset, response, p, q):  # type: ignore[no-untyped-def]
-    """Light of bin p in cell q, and its derivatives by phi_x, phi_y and relative changes of A, B_x, B_y."""
-    u, v, one, two, half = offset[0, p], offset[1, p], np.float32(1), np.float32(2), np.float32(0.5)
-    cx, sx = cos_sin(base[0, p] + (turn[0, 0, q] + turn[0, 1, q] * u + turn[0, 2, q] * v))
-    cy, sy = cos_sin(base[1, p] + (turn[1, 0, q] + turn[1, 1, q] * u + turn[1, 2, q] * v))
-    level = light[0, p] * (maps[0, 0, q] + maps[0, 1, q] * u + maps[0, 2, q] * v)
-    swing_x = light[1, p] * (maps[1, 0, q] + maps[1, 1, q] * u + maps[1, 2, q] * v)
-    swing_y = light[2, p] * (maps[2, 0, q] + maps[2, 1, q] * u + maps[2, 2, q] * v)
-    shade = half + half * half * (cx + cy)
-    power, slope, bent = shade, np.float32(0), np.float32(0)
-    for k in range(4):
-        slope += response[k] * (np.float32(k + 2) * power - one)
-        power *= shade
-        bent += response[k] * (power - shade)
-    cx, cy, steeper = cx + two * bent, cy + two * bent, half * (swing_x + swing_y) * slope
-    by_phases = -(swing_x + steeper) * sx, -(swing_y + steeper) * sy
-    return level + swing_x * cx + swing_y * cy, *by_phases, light[0, p], light[1, p] * cx, light[2, p] * cy
+# One small loop a function, and the rows of a block in one array: so the compiler can tell that nothing overlaps, and
+# finds vector instructions on any processor.
 
 
 @kernel
-def light_waves(base, turn, light, maps, starts, offset, response, out):  # type: ignore[no-untyped-def]
+def _spread(mean, along_u, along_v, offset, out):  # type: ignore[no-untyped-def]
+    """Values (16, 64) of a block's bins on the planes of its cells."""
+    for j in range(_BINS):
+        for q in range(_CELLS):
+            out[j, q] = mean[q] + along_u[q] * offset[0, j, q] + along_v[q] * offset[1, j, q]
+
+
+@kernel
+def _moments(values, offset, mean, along_u, along_v):  # type: ignore[no-untyped-def]
+    """Moments of a block's cells, of values (16, 64)."""
+    mean[:], along_u[:], along_v[:] = 0, 0, 0
+    for j in range(_BINS):
+        for q in range(_CELLS):
+            mean[q] += values[j, q]
+            along_u[q] += values[j, q] * offset[0, j, q]
+            along_v[q] += values[j, q] * offset[1, j, q]
+
+
+@kernel
+def _copy(values, out):  # type: ignore[no-untyped-def]
+    for p in range(out.size):
+        out[p] = values[p]
+
+
+@kernel
+def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
+    """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of phases and maps."""
+    one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
+    for k in range(_BLOCK):
+        p = begin + k
+        cx, sx = cos_sin(base[0, p] + rows[k])
+        cy, sy = cos_sin(base[1, p] + rows[_BLOCK + k])
+        level = light[0, p] * rows[2 * _BLOCK + k]
+        swing_x, swing_y = light[1, p] * rows[3 * _BLOCK + k], light[2, p] * rows[4 * _BLOCK + k]
+        shade = half + half * half * (cx + cy)
+        power, slope, bent = shade, np.float32(0), np.float32(0)
+        for j in range(4):
+            slope += response[j] * (np.float32(j + 2) * power - one)
+            power *= shade
+            bent += response[j] * (power - shade)
+        cx, cy, steeper = cx + two * bent, cy + two * bent, half * (swing_x + swing_y) * slope
+        rows[k] = -(swing_x + steeper) * sx
+        rows[_BLOCK + k] = -(swing_y + steeper) * sy
+        rows[2 * _BLOCK + k] = light[0, p]
+        rows[3 * _BLOCK + k] = light[1, p] * cx
+        rows[4 * _BLOCK + k] = light[2, p] * cy
+        rows[5 * _BLOCK + k] = level + swing_x * cx + swing_y * cy
+
+
+@kernel
+def _weigh(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def]
+    """Turn what `_light` leaves into e w r times the derivatives (5 rows), then `out` of `light_left` (4 rows)."""
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(_BLOCK):
+        p = begin + k
+        shown = rows[5 * _BLOCK + k]
+        r = seen[p] - gain[p] * shown
+        far = max(abs(r) / reach[p] - _TRUSTED, zero) / (one - _TRUSTED) if reach[p] > zero else one
+        w = (one - min(far, one) ** 2) ** 2
+        left = w * r * edge[p] * gain[p]
+        for j in range(5):
+            rows[j * _BLOCK + k] *= left
+        rows[5 * _BLOCK + k] = r
+        rows[6 * _BLOCK + k] = w
+        rows[7 * _BLOCK + k] = left * shown
+        rows[8 * _BLOCK + k] = w * edge[p] * shown * shown
+
+
+@kernel
+def _block(b, base, turn, light, maps, offset, response, rows):  # type: ignore[no-untyped-def]
+    """`_light` of block b."""
+    cells, planes = slice(b * _CELLS, b * _CELLS + _CELLS), rows.reshape(-1, _BINS, _CELLS)
+    for k in range(2):
+        _spread(turn[k, 0, cells], turn[k, 1, cells], turn[k, 2, cells], offset[b], planes[k])
+    for k in range(3):
+        _spread(maps[k, 0, cells], maps[k, 1, cells], maps[k, 2, cells], offset[b], planes[2 + k])
+    _light(rows, base, light, response, b * _BLOCK)
+
+
+@kernel
+def light_waves(base, turn, light, maps, offset, response, out):  # type: ignore[no-untyped-def]
     """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y and of all.
 
     Arguments as in `light_left`.
     """
-    for q in range(starts.size):
-        for p in range(starts[q], starts[q + 1] if q + 1 < starts.size else base.shape[1]):
-            out[5, p], out[0, p], out[1, p], out[2, p], out[3, p], out[4, p] = _waves(
-                base, turn, light, maps, offset, response, p, q
-            )
+    rows = np.empty(6 * _BLOCK, np.float32)
+    for b in range(offset.shape[0]):
+        _block(b, base, turn, light, maps, offset, response, rows)
+        for k in range(6):
+            _copy(rows[k * _BLOCK :], out[k, b * _BLOCK : b * _BLOCK + _BLOCK])
 
 
 @kernel
-def light_left(base, turn, light, maps, starts, offset, response, edge, gain, seen, reach, pull, out):  # type: ignore[no-untyped-def]
+def light_left(base, turn, light, maps, offset, response, edge, gain, seen, reach, pull, out):  # type: ignore[no-untyped-def]
     """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a relative change of all
     light and e w times its square; and of their N cells in `pull` (5, 3, N) moments of e w r times the others.
 
     `base` (2, n) are phases and `light` (3, n) A, B_x, B_y, `turn` (2, 3, N) and `maps` (3, 3, N) the planes of their
-    changes, `starts` (N,) and `offset` (2, n) as in `Cells`, `edge` (n,) is e, `gain` (n,) multiplies all light,
-    `reach` (n,) is where w ends; 0 leaves out. All are of single precision, or no vector units are used.
+    changes, `offset` as in `Cells`, `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends;
+    0 leaves out. All are of single precision, or no vector units are used.
     """
-    zero, one = np.float32(0), np.float32(1)
-    for q in range(starts.size):
-        a = au = av = b = bu = bv = c = cu = cv = d = du = dv = f = fu = fv = zero
-        for p in range(starts[q], starts[q + 1] if q + 1 < starts.size else base.shape[1]):
-            shown, by_x, by_y, by_level, by_swing_x, by_swing_y = _waves(
-                base, turn, light, maps, offset, response, p, q
-            )
-            u, v, r = offset[0, p], offset[1, p], seen[p] - gain[p] * shown
-            far = max(abs(r) / reach[p] - _TRUSTED, zero) / (one - _TRUSTED) if reach[p] > zero else one
-            w = (one - min(far, one) ** 2) ** 2
-            left = w * r * edge[p] * gain[p]
-            of_x, of_y, of_level = left * by_x, left * by_y, left * by_level
-            of_swing_x, of_swing_y = left * by_swing_x, left * by_swing_y
-            a, au, av = a + of_x, au + of_x * u, av + of_x * v
-            b, bu, bv = b + of_y, bu + of_y * u, bv + of_y * v
-            c, cu, cv = c + of_level, cu + of_level * u, cv + of_level * v
-            d, du, dv = d + of_swing_x, du + of_swing_x * u, dv + of_swing_x * v
-            f, fu, fv = f + of_swing_y, fu + of_swing_y * u, fv + of_swing_y * v
-            out[0, p], out[1, p], out[2, p], out[3, p] = r, w, left * shown, w * edge[p] * shown * shown
-        for k, moments in enumerate(((a, au, av), (b, bu, bv), (c, cu, cv), (d, du, dv), (f, fu, fv))):
-            pull[k, 0, q], pull[k, 1, q], pull[k, 2, q] = moments
+    rows = np.empty(9 * _BLOCK, np.float32)
+    planes = rows.reshape(-1, _BINS, _CELLS)
+    for b in range(offset.shape[0]):
+        cells = slice(b * _CELLS, b * _CELLS + _CELLS)
+        _block(b, base, turn, light, maps, offset, response, rows)
+        _weigh(rows, edge, gain, seen, reach, b * _BLOCK)
+        for k in range(5):
+            _moments(planes[k], offset[b], pull[k, 0, cells], pull[k, 1, cells], pull[k, 2, cells])
+        for k in range(4):
+            _copy(rows[(5 + k) * _BLOCK :], out[k, b * _BLOCK : b * _BLOCK + _BLOCK])
 
 
 def scene_of(
@@ -230,7 +308,7 @@ def scene_of(
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
     known = np.isfinite(coarse).all(axis=0)
-    index, cells = Cells.of(np.flatnonzero(known), columns)
+    index, counted, cells = Cells.of(np.flatnonzero(known), columns)
     grid = bins.BinGrid(tracer.geometry, camera, bin_px)
     points = reconstruct.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
@@ -239,7 +317,7 @@ def scene_of(
     seen_rad = tracer.predict_screen(points, shape) * rad_per_mm
     fringe = 2 * math.pi / _rad_per_bin(index, (rows, columns), seen_rad, _USUAL)
     inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[1:-1, 1:-1].reshape(-1)[index]
-    taper = np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2).astype(np.float32) ** 2
+    taper = (np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2) ** 2 * counted).astype(np.float32)
     return CrossedScene(
         tracer=tracer,
         surface=shape,

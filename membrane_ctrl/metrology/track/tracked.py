@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.optics import surface
+from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.model import shape_estimate
@@ -224,29 +225,28 @@ class Squares:
         self._number = _squares(scene.position_mm, scene.surface.radius_mm, 12)
         self._count = np.bincount(self._number)
         self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
-        self._level = self._means(scene.light_adu[0])
-        waves = scene.light_adu[1:] * np.exp(1j * scene.phase_rad(scene.surface))
-        parts = [np.hypot(self._means(wave.real), self._means(wave.imag)) for wave in waves]
-        self._fringe = np.sum(parts, axis=0) / self._level  # that does not average out
+        self._light_adu = scene.light_adu[0].astype(np.float32)
+        waves = (scene.light_adu[1:] * np.exp(1j * scene.phase_rad(scene.surface))).astype(np.complex64)
+        swing = np.sum((scene.light_adu[1:] / self._light_adu) ** 2, axis=0, dtype=np.float32)
+        means = self._means(self._light_adu, swing, *waves.real, *waves.imag)
+        self._level, self._swing = means[0], np.sqrt(means[1] / 2)
+        self._fringe = np.hypot(means[2:4], means[4:]).sum(axis=0) / self._level  # that does not average out
         self._even = self._whole & (self._fringe <= max(_UNEVEN, float(np.median(self._fringe[self._whole]))))
-        self._light_adu = scene.light_adu[0]
-        self._swing = np.sqrt(self._means(np.sum((scene.light_adu[1:] / self._light_adu) ** 2, axis=0)) / 2)
 
-    def _means(self, values: FloatArray | Singles) -> FloatArray:
-        return np.asarray(np.bincount(self._number, values) / self._count)
+    def _means(self, *values: Singles) -> FloatArray:
+        return np.asarray(sums_by(self._number, np.stack(values), self._count.size) / self._count)
 
     def look(self, seen: Singles) -> tuple[float, BoolArray]:
         """Light of a frame over the scene's, and the squares whose light is wrong."""
-        share = self._means(seen) / self._level
+        share, contrast = self._shares(seen)
         light = float(np.median(share[self._even]))
         wrong = np.abs(share - light) > (_COVERED + self._fringe) * max(light, 1e-6)
-        contrast = self._contrasts(seen)
         grey = self._even & (contrast < _GREY * float(np.median(contrast[self._even])))
         return light, self._whole & (wrong | grey)
 
     def blinded(self, seen: Singles, covered: float) -> Finding | None:
         """Why a frame has no fit, if it is not that the mirror moved; `covered` is a share of the squares."""
-        contrast = float(np.median(self._contrasts(seen)[self._even]))
+        contrast = float(np.median(self._shares(seen)[1][self._even]))
         if contrast < _CONTRAST:
             return Finding("rejected", f"no fringes: {contrast:.0%} of the reference's contrast")
         if covered > _COVERED_DEGRADED:
@@ -254,11 +254,12 @@ class Squares:
             return Finding("rejected", f"covered or order lost: {left}", lost=True)
         return None
 
-    def _contrasts(self, seen: Singles) -> FloatArray:
+    def _shares(self, seen: Singles) -> FloatArray:
+        """Of the scene's light and contrast (2, squares)."""
         share = seen / self._light_adu
-        mean = self._means(share)
-        scatter = np.sqrt(np.maximum(self._means(share**2) - mean**2, 0.0))
-        return np.asarray(scatter / self._swing / np.maximum(mean, 1e-6))
+        level, mean, square = self._means(seen, share, share**2)
+        scatter = np.sqrt(np.maximum(square - mean**2, 0.0))
+        return np.stack([level / self._level, scatter / self._swing / np.maximum(mean, 1e-6)])
 
     def bins(self, chosen: BoolArray) -> BoolArray:
         """The bins (n,) of squares."""
