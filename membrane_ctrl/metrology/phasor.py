@@ -149,7 +149,8 @@ class Binner:
                 pixels = np.ascontiguousarray(frame)
                 _bin_rows(pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop)
 
-        split(run, self.sums.shape[1])
+        rows = self.sums.shape[1]
+        split(run, rows, 0 if len(frames) > 1 else rows + 1)  # to wake a thread costs more than half a frame
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ _MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
 # Largest last change of a frame that is not lost: at the rim, where it is ten times that of the terms. Steps shrink
 # slowly where the weights of many bins change with them.
 _SETTLED_MM = 1e-5
-_ALL_ADU = 1e6  # a reach beyond which no bin is
+_ALL_ADU = np.float32(1e6)  # a reach beyond which no bin is
 _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
 _LINEAR_MM = 1e-3  # at the rim; between two exact traces phases follow their derivatives: 0.3 nm off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
@@ -84,7 +84,7 @@ class FrameFitter:
         self._maps = np.empty_like(self._pull[:3])
         self._response = scene.response.astype(np.float32)
 
-    def fit(self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: FloatArray) -> FrameFit:
+    def fit(self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: Singles) -> FrameFit:
         """Fit a frame, means `seen_adu` (n,) over the bins, from the last solution.
 
         From a residual of `reach_adu` (n,) on a bin has no weight; 0 leaves it out.
@@ -105,13 +105,13 @@ class FrameFitter:
         self._inverse = self._inverted(shifts_rad, start.surface, start.light, start.weights)
 
     def _descend(
-        self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: FloatArray, patient: bool
+        self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: Singles, patient: bool
     ) -> FrameFit:
         """Take steps until they vanish, lead astray or need too many matrices; small steps may if `patient`."""
         shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
         bands = np.zeros(len(self.bands.waves))
         if bands.size:  # each frame has others: without them, much would be an outlier at first
-            self._evaluate(seen_adu, shifts_rad, shape, light, bands, np.where(reach > 0, _ALL_ADU, 0.0))
+            self._evaluate(seen_adu, shifts_rad, shape, light, bands, _ALL_ADU * (reach > 0))
             bands = fitted_waves(self.bands.waves, self.rows())
         for _ in range(_MAX_STEPS):
             self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
@@ -139,11 +139,11 @@ class FrameFitter:
         shape: Surface,
         light: FloatArray,
         bands: FloatArray,
-        reach: FloatArray,
+        reach: Singles,
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface, maps of light and bands."""
         gain = self.bands.gain(bands)
-        seen = self.scene.edge, gain, seen_adu, reach.astype(np.float32)
+        seen = self.scene.edge, gain, seen_adu, reach
         light_left(*self._shown(shifts_rad, shape, light), *seen, self._pull, self._out)
 
     def rows(self) -> FloatArray:

@@ -81,6 +81,7 @@ class Tracker:
     def _begin(self, scene: CrossedScene, shape: surface.Surface, light: FloatArray) -> None:
         """Start from a scene, a surface and maps (3, 36) of light."""
         none, all_bins = np.zeros(scene.index.size, np.float32), np.ones(scene.index.size, np.float32)
+        self._level_adu = scene.light_adu[0].astype(np.float32)
         self._swing_adu = float(np.median(scene.light_adu[1]))
         self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
         self._last = FrameFit(shape, light, none, all_bins, True)
@@ -214,7 +215,7 @@ class Tracker:
         self._binner.clear()
         self._binner.add([frame], [0])
         index = self._fitter.scene.index
-        seen = (self._binner.sums[0].ravel()[index] / np.float32(self._binner.bin_px**2)).astype(np.float32)
+        seen = self._binner.sums[0].ravel()[index].astype(np.float32) / np.float32(self._binner.bin_px**2)
         same, self._seen = bool(np.array_equal(seen, self._seen)), seen
         if same and not self._blind:
             return tracked.rejected_frame(time_s, "frozen: the frame is identical to the one before")
@@ -285,11 +286,11 @@ class Tracker:
         """Fit without outliers, at first of the last frame's scale: a film that moved needs all bins to begin."""
         fit = start
         # light wanders in proportion to itself: bright fringes in a bright patch are no outliers
-        bright = np.maximum(seen / self._fitter.scene.light_adu[0], 1.0)
+        bright = np.maximum(seen / self._level_adu, np.float32(1)) * ~left_out
         for first in filter(None, (self._scale_adu, _FIRST_REACH)):
             fit, scale = start, first
             for _ in range(4):
-                fit = self._fitter.fit(seen, shifts_rad, fit, np.where(left_out, 0.0, _REACH_SIGMAS * scale * bright))
+                fit = self._fitter.fit(seen, shifts_rad, fit, np.float32(_REACH_SIGMAS * scale) * bright)
                 found = self._scale_of(fit)
                 if 0.67 * scale < found < 1.5 * scale or self._lost(fit):
                     break
