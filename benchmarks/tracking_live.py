@@ -35,7 +35,7 @@ from tests.support.gige_camera import GigeCameraEmulator
 
 OPTICS = OpticsConfig()
 RATE_HZ, EXPOSURE_MS, PERIODS, STEP_S = 20.0, 10.0, 32, 10.0
-NOISES = 4  # pictures of each crossed pattern
+NOISES = 4  # pictures of each crossed pattern, and one that gives the bins their light and never comes again
 FRAMES = 400
 SETTLE_S = 0.03
 PATIENCE_S = 120.0
@@ -43,16 +43,15 @@ PATIENCE_S = 120.0
 
 def _camera(shown: Synchronized[int], ready: Any, done: Any) -> None:
     """Answer as a camera until `done`."""
-    renderers = [OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=seed) for seed in range(NOISES)]
+    renderers = [OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=seed) for seed in range(NOISES + 1)]
     pictures = [[renderers[0].render(pattern, 0.0).copy()] for pattern in full_sequence(OPTICS.pattern)]
     pictures += [[r.render(pattern, 0.0).copy() for r in renderers] for pattern in crossed_patterns(PERIODS)]
-    count = 0
+    counts = [0] * len(pictures)
 
     def expose(exposure_ms: float, gain: int) -> Any:
-        nonlocal count
-        count += 1
-        of = pictures[shown.value]
-        return of[count % len(of)]
+        of, count = pictures[shown.value], counts[shown.value]
+        counts[shown.value] += 1
+        return of[1 + count % NOISES if count and len(of) > 1 else 0]
 
     with GigeCameraEmulator(expose, OPTICS.camera.width_px, OPTICS.camera.height_px):
         ready.set()

@@ -31,18 +31,12 @@ class BoardSettingsError(ValueError):
 def record(table: Mapping[str, Any]) -> bytes:
     """The record of a board's settings.
 
-    Parameters
-    ----------
-    table : mapping
-        As read from TOML: `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by default the standard's),
-        `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value], [raw,
-        value]], in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). An
-        omitted channel arrives in counts of its register.
+    `table`, as read from TOML, has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by default the
+    standard's), `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value],
+    [raw, value]], in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). An
+    omitted channel arrives in counts of its register.
 
-    Raises
-    ------
-    BoardSettingsError
-        An unknown or missing key, or a value outside what the board takes.
+    Raises BoardSettingsError (an unknown or missing key, or a value outside what the board takes).
     """
     _check_keys("", table, _KEYS)
     baud = _whole(table, "baud", 1200, 1_000_000, 115_200)

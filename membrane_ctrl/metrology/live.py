@@ -52,10 +52,7 @@ class LiveReconstructor:
     spread : GeometrySpread, optional
         How well the geometry is known; with it the first full cycle computes `common_covariance_um2`.
 
-    Raises
-    ------
-    ValueError
-        If the phase steps do not determine a phase, or are not the pattern's in number.
+    Raises ValueError if the phase steps do not determine a phase, or are not the pattern's in number.
     """
 
     def __init__(

@@ -42,15 +42,9 @@ def _peak(frame, first, last, width):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fold_four(line, quarter, size):  # type: ignore[no-untyped-def]
-    for c in range(size):
-        quarter[c] = line[4 * c] + line[4 * c + 1] + line[4 * c + 2] + line[4 * c + 3]
-
-
-@kernel
-def _fold_two(line, out):  # type: ignore[no-untyped-def]
+def _halve(line, out):  # type: ignore[no-untyped-def]
     for b in range(out.size):
-        out[b] = np.uint32(line[2 * b]) + np.uint32(line[2 * b + 1])
+        out[b] = line[2 * b] + line[2 * b + 1]
 
 
 @kernel
@@ -75,21 +69,21 @@ def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: igno
 def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
     """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to `saturated`.
 
-    `line` (2, width) is memory of a type that holds the sum of `bin_px` pixels.
+    `line` (2, width) is memory of a type that holds the sum of a bin's pixels, unless its side is odd.
     """
     width = line.shape[1]
     for row in range(start, stop):
         first, last = row * bin_px, row * bin_px + bin_px
         _add_lines(frame, first, last, line[0])
-        if bin_px == 4:
-            _fold_four(line[0], line[1], sums.shape[1])
-            for b in range(sums.shape[1]):
-                sums[row, b] = line[1, b]
-        elif bin_px == 8:
-            _fold_four(line[0], line[1], 2 * sums.shape[1])
-            _fold_two(line[1], sums[row])
+        here, there, side = line[0], line[1], bin_px
+        while side % 2 == 0 and side > 2:
+            side //= 2
+            _halve(here, there[: sums.shape[1] * side])
+            here, there = there, here
+        if side == 2:
+            _halve(here, sums[row])
         else:
-            _fold(line[0], bin_px, sums[row])
+            _fold(here, side, sums[row])
         if _peak(frame, first, last, width) >= full_scale:
             _count_saturated(frame, first, last, bin_px, full_scale, saturated[row])
 
@@ -144,8 +138,8 @@ class Binner:
 
         def run(start: int, stop: int) -> None:
             for frame, slot, limit in zip(frames, slots, limits, strict=True):
-                # 16 rows of 8 bits fit 16 bits
-                line = np.empty((2, width), np.uint16 if frame.dtype == np.uint8 else np.uint32)
+                fits = frame.dtype == np.uint8 and self.bin_px <= 16  # 256 pixels of 8 bits fit 16 bits
+                line = np.empty((2, width), np.uint16 if fits else np.uint32)
                 pixels = np.ascontiguousarray(frame)
                 _bin_rows(pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop)
 

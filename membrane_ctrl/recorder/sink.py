@@ -176,10 +176,7 @@ class Recording:
     def close(self) -> None:
         """Write the footer and close the file.
 
-        Raises
-        ------
-        RecordingError
-            If the file has no footer: it then opens slowly, and may lack its last second.
+        Raises RecordingError if the file has no footer: it then opens slowly, and may lack its last second.
         """
         self.flush()
         self._stream.disconnect()

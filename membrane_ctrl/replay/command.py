@@ -90,10 +90,7 @@ DECISION_SLACK_S = 0.5
 def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool) -> int:
     """Replay and report; exit 3 if a row or a decision differs, else 0.
 
-    Raises
-    ------
-    InputError
-        If the run cannot be replayed, has no such part, or (with `to_test`) the name is taken.
+    Raises InputError if the run cannot be replayed, has no such part, or (with `to_test`) the name is taken.
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
@@ -226,10 +223,8 @@ def write_incident(
 
     It starts at the tick `begin`: the run's first, or one with a recorded controller memory.
 
-    Raises
-    ------
-    InputError
-        If the name is invalid or taken, the folder is missing, or the test is too large for a repository.
+    Raises InputError if the name is invalid or taken, the folder is missing, or the test is too large for a
+    repository.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"--to-test {name!r}: use small letters, digits, '-' and '_'")

@@ -77,10 +77,7 @@ class FileFinding:
 def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
     """Repair and report; exit 0 also if nothing was wrong.
 
-    Raises
-    ------
-    InputError
-        If it is not a run folder, or the run is still in progress.
+    Raises InputError if it is not a run folder, or the run is still in progress.
     """
     findings = repair(run_dir, in_place)
     if as_json:

@@ -83,10 +83,8 @@ def replay(
 
     The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not compared.
 
-    Raises
-    ------
-    UnknownMemoryError
-        If today's code cannot load the record's first memory, or a tick raises after loading one.
+    Raises UnknownMemoryError if today's code cannot load the record's first memory, or a tick raises after loading
+    one.
     """
     controller = Controller(config, sag_sensitivity)
     found = Replay()

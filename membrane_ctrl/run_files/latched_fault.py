@@ -115,13 +115,7 @@ class LatchedFile:
 
 
 class ResumeLog:
-    """When faults cleared automatically, so that a restart does not reset the day's count.
-
-    Parameters
-    ----------
-    logs_dir : Path
-        Folder of the runs.
-    """
+    """When faults cleared automatically, so that a restart does not reset the day's count; beside the runs."""
 
     def __init__(self, logs_dir: Path) -> None:
         self.path = logs_dir / RESUMES_NAME

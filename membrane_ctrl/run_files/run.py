@@ -246,17 +246,9 @@ def _listed(blocks: Generator[Block, None, _Reach]) -> tuple[list[Block], _Reach
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run folder, even of a run that is in progress, was killed, or lacks parts.
+    """Open a run folder, or that of a file in it, even of a run that is in progress, was killed, or lacks parts.
 
-    Parameters
-    ----------
-    path : str or Path
-        Folder of the run, or a file in it.
-
-    Raises
-    ------
-    InputError
-        If there is no such folder, or it contains nothing of a run.
+    Raises InputError if there is no such folder, or it contains nothing of a run.
     """
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []

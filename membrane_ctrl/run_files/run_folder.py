@@ -31,12 +31,9 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
 
     A second run in the same second gets the suffix `-2`.
 
-    Raises
-    ------
-    InputError
-        If the name has characters other than letters, digits, dot, dash and underscore.
-    DeviceError
-        If the folder cannot be written or the disk has less than `recording.min_free_mb` free; leaves nothing behind.
+    Raises InputError if the name has characters other than letters, digits, dot, dash and underscore. Raises
+    DeviceError, and leaves nothing behind, if the folder cannot be written or the disk has less than
+    `recording.min_free_mb` free.
     """
     if not _NAME.fullmatch(name):
         raise errors.InputError(
@@ -157,10 +154,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     text : str
         Text of the mark.
 
-    Raises
-    ------
-    DeviceError
-        If the folder cannot be written.
+    Raises DeviceError if the folder cannot be written.
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
     mark = run_events.Mark(text, _user(), made_utc=datetime.now(UTC).isoformat(timespec="seconds"))

@@ -81,10 +81,7 @@ def panics_are_faults() -> Iterator[None]:
 def require_bounded(path: Path) -> None:
     """Check a segment before Rerun, which allocates whatever memory a message requests.
 
-    Raises
-    ------
-    OSError
-        Not a regular file, or one that would inflate to more than a recorder writes.
+    Raises OSError (not a regular file, or one that would inflate to more than a recorder writes).
     """
     total = end = 0
     with open_plain(path) as file:
@@ -186,9 +183,7 @@ def ending(path: Path) -> tuple[bool, int]:
     Does not read the content of messages. Rerun takes a file that ends between two messages, or within the head of
     one, as whole.
 
-    Raises
-    ------
-    OSError
+    Raises OSError.
     """
     found, size = whole_messages(path), path.stat().st_size
     behind = size - (found[-1].end if found else 0)
@@ -222,10 +217,7 @@ def read_chunks(path: Path, entities: set[str]) -> list["Chunk"]:
 def salvage(path: Path, entities: set[str]) -> tuple[list["Chunk"], int]:
     """Chunks of some entities in a segment that Rerun refuses, and the number of bytes lost.
 
-    Raises
-    ------
-    OSError
-        If the segment is unreadable, or there is no room for the copy.
+    Raises OSError if the segment is unreadable, or there is no room for the copy.
     """
     found = whole_messages(path)
     size = path.lstat().st_size

@@ -75,6 +75,11 @@ def bench(reference: SetFigure) -> Bench:
     return Bench(scene, Tracker(scene, SIZE, 255, OPTICS.camera.noise_adu))
 
 
+def test_no_bin_of_a_scene_counts_twice(bench: Bench) -> None:
+    counted = bench.scene.index[bench.scene.edge > 0]
+    assert np.unique(counted).size == counted.size < bench.scene.index.size
+
+
 def with_terms(by_um: dict[int, float]) -> FilmShape:
     terms = np.zeros(36)
     terms[: len(FILM.zernike_um)] = FILM.zernike_um

@@ -29,7 +29,7 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     Poses,
     screen_elsewhere,
 )
-from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
+from membrane_ctrl.metrology.optics import film_law, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
@@ -317,8 +317,8 @@ def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     bowl = series.polyval(v, excess) - excess[0]
     grows = 2 * series.polyval(v, series.polyder(excess))
     powers, tables = _monomials(x, y), _tables()
-    heights = compiled.multiply(tables[0], powers) - zernike.at_vertex()[1:, None]
-    slopes_x, slopes_y = compiled.multiply(tables[1], powers), compiled.multiply(tables[2], powers)
+    heights, slopes_x, slopes_y = (table @ powers for table in tables)
+    heights -= zernike.at_vertex()[1:, None]
     return np.vstack([heights, bowl]), np.vstack([slopes_x, grows * x]), np.vstack([slopes_y, grows * y])
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics import film_law
-from membrane_ctrl.metrology.optics.compiled import gram
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface, beyond_of
 from membrane_ctrl.metrology.optics.zernike import DEGREE
 from membrane_ctrl.model.arrays import FloatArray
@@ -212,7 +211,8 @@ def _fringes(parts: Iterable[residuals.Chunk], root: FloatArray, moved: bool) ->
             columns = [derivatives[:, residuals.COLUMNS :], residuals.deeper(motion)[:, None], motion[:, None]]
             derivatives = np.concatenate([*columns, derivatives[:, : residuals.COLUMNS]], axis=1)
         for rows, miss in zip(derivatives, part.residual_mm, strict=True):
-            sums[np.ix_(keep, keep)] += gram(np.vstack([rows, miss]) * root[part.place])
+            weighed = np.vstack([rows, miss]) * root[part.place]
+            sums[np.ix_(keep, keep)] += weighed @ weighed.T
     return sums, left
 
 

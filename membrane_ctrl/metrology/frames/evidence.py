@@ -213,12 +213,8 @@ class BinView:
 def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> BinView:
     """Combine the frames that are not excluded.
 
+    `estimate` (rows, columns) is the light that another set saw, the third estimate of a set without white and black.
     Raises NoFigureError if an axis has fewer than three usable steps, or if there are no fringes.
-
-    Parameters
-    ----------
-    estimate : (rows, columns) array, optional
-        The light as another set saw it: the third estimate of a set without white and black.
     """
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
     light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)

@@ -84,12 +84,10 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
 
 def values(x: FloatArray, y: FloatArray) -> FloatArray:
     """All terms, (36, ...), at points of the unit disc."""
-    return _evaluate(monomial_table(), x, y)
-
-
-def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """d/dx and d/dy of all terms, each (36, ...), at points of the unit disc."""
-    return _evaluate(differentiate(monomial_table(), 1), x, y), _evaluate(differentiate(monomial_table(), 2), x, y)
+    p, q = np.array([(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]).T
+    powers_x = np.stack([x**k for k in range(DEGREE + 1)])
+    powers_y = np.stack([y**k for k in range(DEGREE + 1)])
+    return np.asarray(np.tensordot(monomial_table()[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
 def differentiate(table: FloatArray, axis: int) -> FloatArray:
@@ -97,13 +95,6 @@ def differentiate(table: FloatArray, axis: int) -> FloatArray:
     powers = np.arange(DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(3)])
     out = np.roll(table * powers, -1, axis=axis)
     return np.asarray(out)
-
-
-def _evaluate(table: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    p, q = np.array([(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]).T
-    powers_x = np.stack([x**k for k in range(DEGREE + 1)])
-    powers_y = np.stack([y**k for k in range(DEGREE + 1)])
-    return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
 def at_vertex() -> FloatArray:

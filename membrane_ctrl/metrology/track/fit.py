@@ -80,8 +80,7 @@ class FrameFitter:
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((4, scene.index.size), np.float32)
-        self._pull = np.empty((5, *self._basis.shape[1:]), np.float32)
-        self._maps = np.empty_like(self._pull[:3])
+        self._slow, self._pull = self._cells.blocks(*self.jacobian, self._basis), np.empty((4, PARAMETERS))
         self._response = scene.response.astype(np.float32)
 
     def fit(self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: Singles) -> FrameFit:
@@ -142,9 +141,8 @@ class FrameFitter:
         reach: Singles,
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface, maps of light and bands."""
-        gain = self.bands.gain(bands)
-        seen = self.scene.edge, gain, seen_adu, reach
-        light_left(*self._shown(shifts_rad, shape, light), *seen, self._pull, self._out)
+        known = self.scene.edge, self.bands.gain(bands)
+        light_left(*self._shown(shifts_rad, shape, light), *known, seen_adu, reach, self._pull, self._out)
 
     def rows(self) -> FloatArray:
         """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
@@ -152,28 +150,17 @@ class FrameFitter:
 
     def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
         """What the kernels take a frame's light from."""
-        turn, offset = self._turned(shape, light), self._cells.offset
-        turn[:, 0] += np.array(shifts_rad, np.float32)[:, None]
-        return self._base, turn, self._light_adu, self._maps, offset, self._response
-
-    def _turned(self, shape: Surface, light: FloatArray) -> Singles:
-        """Planes (2, 3, N) of a surface's phases beyond those of the one traced last; the maps follow the light."""
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
             self._traced, moved = shape, np.zeros(PARAMETERS)
             self._base = _reduced(self.scene.phase_rad(shape))
-        self._maps[:] = np.tensordot(light.astype(np.float32), self._basis, 1)
-        self._maps[:, 0] += 1
-        return np.asarray(moved.astype(np.float32) @ _flat(self.jacobian)).reshape(2, 3, -1)
+        changes, shifts = np.vstack([moved, light]).astype(np.float32), np.array(shifts_rad, np.float32)
+        return self._base, self._light_adu, self._slow, self._cells.offset, self._response, changes, shifts
 
     def _right(self) -> FloatArray:
         """J^T W r (144 + 2 k,) of the last evaluation."""
-        pull = _flat(self._pull)
-        of_surface = sum(_flat(slow) @ one for slow, one in zip(self.jacobian, pull[:2], strict=True))
-        parts = [of_surface, (pull[2:] @ _flat(self._basis).T).ravel()]
-        if len(self.bands.waves):
-            parts.append(self.bands.waves @ self.rows()[0])
-        return np.concatenate(parts).astype(float)
+        bands = self.bands.waves @ self.rows()[0] if len(self.bands.waves) else np.zeros(0)
+        return np.concatenate([self._pull.ravel(), bands])
 
     def _waves(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> Singles:
         """Rows (6, n): dI by phi_x, by phi_y, by relative changes of A, B_x, B_y, and of all light."""
@@ -245,10 +232,6 @@ class FrameFitter:
         means = self.jacobian[:, :, 0].astype(float)
         matrix = sum(j @ j.T for j in means)
         return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
-
-
-def _flat(planes: AnyArray) -> AnyArray:
-    return planes.reshape(*planes.shape[:-2], -1)
 
 
 def _reduced(phase_rad: FloatArray) -> Singles:

@@ -7,27 +7,25 @@ bin, and shape that 36 terms cannot represent. Light and response of the panel a
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, phase, reconstruct
+from membrane_ctrl.metrology.bins import BLOCK_BINS, BLOCK_CELLS, CELL_BINS, Cells, combine, moments, project, spread
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.compiled import kernel
 from membrane_ctrl.metrology.optics.kernels import cos_sin
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.model.arrays import AnyArray, BoolArray, FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 # A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
-_SIDE = 4  # bins along a cell's side, over which what changes slowly is a plane: 1 % of the highest terms at the rim
-_BINS, _CELLS = _SIDE**2, 64  # of a cell, and of a block of cells, whose nine rows fit the first cache
-_BLOCK = _BINS * _CELLS
+_AT = 0, PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS  # in `Cells.blocks`: x, y, then the maps' terms
 _ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
@@ -43,67 +41,6 @@ _USUAL = 0.75  # quantile of the changes of phase, half of which are across the 
 # bright and dark fringes as soon as light wanders, and bend the figure: 20 nm of sag at 0.5 %.
 _TRUSTED = np.float32(0.6)
 _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Squares of bins, N of them, over each of which what changes slowly is a plane.
-
-    64 cells are a block: their first bins, then their second ones, and so on, so that loops over a block use vector
-    units. A cell with fewer bins repeats one, as the last block repeats a cell; what is repeated counts once, because
-    its weight is 0 (`of`).
-    """
-
-    offset: Singles  # (N / 64, 2, 16, 64): of the bins, from the mean of their cell's
-
-    @staticmethod
-    def of(index: IntArray, columns: int) -> "tuple[IntArray, BoolArray, Cells]":
-        """Bins (n,) in the order of the cells, whether each counts, and the cells."""
-        square = index // columns // _SIDE * columns + index % columns // _SIDE
-        order = np.argsort(square, kind="stable")
-        _, starts, counts = np.unique(square[order], return_index=True, return_counts=True)
-        place = np.arange(_BINS)
-        bin_of = starts[:, None] + np.where(counts[:, None] > place, place, 0)
-        more = -len(starts) % _CELLS
-        blocks = np.pad(bin_of, ((0, more), (0, 0)), "edge").reshape(-1, _CELLS, _BINS).swapaxes(1, 2)
-        counted = np.pad(counts[:, None] > place, ((0, more), (0, 0))).reshape(-1, _CELLS, _BINS).swapaxes(1, 2)
-        index = index[order][blocks]
-        at = np.stack([index % columns, index // columns], axis=1)
-        offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
-        return index.ravel(), counted.ravel(), Cells(offset)
-
-    @cached_property
-    def _offsets(self) -> Singles:
-        """(2, n)."""
-        return self.offset.swapaxes(0, 1).reshape(2, -1)
-
-    def sums(self, values: AnyArray) -> AnyArray:
-        """Of the cells (..., N) of bins (..., n)."""
-        lead, blocks = values.shape[:-1], len(self.offset)
-        return np.asarray(values.reshape(*lead, blocks, _BINS, _CELLS).sum(axis=-2).reshape(*lead, blocks * _CELLS))
-
-    def moments(self, values: AnyArray) -> AnyArray:
-        """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
-        return np.stack([self.sums(values), *(self.sums(values * one) for one in self._offsets)], axis=-2)
-
-    def each(self, values: AnyArray) -> AnyArray:
-        """Of the bins (..., n) those of their cells (..., N)."""
-        lead, blocks = values.shape[:-1], len(self.offset)
-        repeated = np.repeat(values.reshape(*lead, blocks, 1, _CELLS), _BINS, axis=-2)
-        return repeated.reshape(*lead, blocks * _BLOCK)
-
-    def spread(self, planes: AnyArray) -> AnyArray:
-        """Values (..., n) of the bins on planes (..., 3, N) of the cells."""
-        mean, along_u, along_v = self.each(np.moveaxis(planes, -2, 0))
-        u, v = self._offsets
-        return np.asarray(mean + along_u * u + along_v * v)
-
-    def planes(self, values: AnyArray) -> Singles:
-        """The planes (..., 3, N) that fit values of bins (..., n) best."""
-        weights = self.moments(np.stack([np.ones_like(self._offsets[0]), *self._offsets]))
-        weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
-        inverse = np.linalg.inv(weights.transpose(2, 0, 1))
-        return np.asarray(np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32, order="C")
 
 
 @dataclass(frozen=True)
@@ -157,45 +94,19 @@ class CrossedScene:
         return np.asarray(2 * self.light_adu[1:].sum(axis=0) * bent)
 
 
-# One small loop a function, and the rows of a block in one array: so the compiler can tell that nothing overlaps, and
-# finds vector instructions on any processor.
-
-
-@kernel
-def _spread(mean, along_u, along_v, offset, out):  # type: ignore[no-untyped-def]
-    """Values (16, 64) of a block's bins on the planes of its cells."""
-    for j in range(_BINS):
-        for q in range(_CELLS):
-            out[j, q] = mean[q] + along_u[q] * offset[0, j, q] + along_v[q] * offset[1, j, q]
-
-
-@kernel
-def _moments(values, offset, mean, along_u, along_v):  # type: ignore[no-untyped-def]
-    """Moments of a block's cells, of values (16, 64)."""
-    mean[:], along_u[:], along_v[:] = 0, 0, 0
-    for j in range(_BINS):
-        for q in range(_CELLS):
-            mean[q] += values[j, q]
-            along_u[q] += values[j, q] * offset[0, j, q]
-            along_v[q] += values[j, q] * offset[1, j, q]
-
-
-@kernel
-def _copy(values, out):  # type: ignore[no-untyped-def]
-    for p in range(out.size):
-        out[p] = values[p]
+# As in `bins`: small loops over the rows of a block, all in one array.
 
 
 @kernel
 def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
     """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of phases and maps."""
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
-    for k in range(_BLOCK):
+    for k in range(BLOCK_BINS):
         p = begin + k
         cx, sx = cos_sin(base[0, p] + rows[k])
-        cy, sy = cos_sin(base[1, p] + rows[_BLOCK + k])
-        level = light[0, p] * rows[2 * _BLOCK + k]
-        swing_x, swing_y = light[1, p] * rows[3 * _BLOCK + k], light[2, p] * rows[4 * _BLOCK + k]
+        cy, sy = cos_sin(base[1, p] + rows[BLOCK_BINS + k])
+        level = light[0, p] * rows[2 * BLOCK_BINS + k]
+        swing_x, swing_y = light[1, p] * rows[3 * BLOCK_BINS + k], light[2, p] * rows[4 * BLOCK_BINS + k]
         shade = half + half * half * (cx + cy)
         power, slope, bent = shade, np.float32(0), np.float32(0)
         for j in range(4):
@@ -204,75 +115,76 @@ def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
             bent += response[j] * (power - shade)
         cx, cy, steeper = cx + two * bent, cy + two * bent, half * (swing_x + swing_y) * slope
         rows[k] = -(swing_x + steeper) * sx
-        rows[_BLOCK + k] = -(swing_y + steeper) * sy
-        rows[2 * _BLOCK + k] = light[0, p]
-        rows[3 * _BLOCK + k] = light[1, p] * cx
-        rows[4 * _BLOCK + k] = light[2, p] * cy
-        rows[5 * _BLOCK + k] = level + swing_x * cx + swing_y * cy
+        rows[BLOCK_BINS + k] = -(swing_y + steeper) * sy
+        rows[2 * BLOCK_BINS + k] = light[0, p]
+        rows[3 * BLOCK_BINS + k] = light[1, p] * cx
+        rows[4 * BLOCK_BINS + k] = light[2, p] * cy
+        rows[5 * BLOCK_BINS + k] = level + swing_x * cx + swing_y * cy
 
 
 @kernel
 def _weigh(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def]
     """Turn what `_light` leaves into e w r times the derivatives (5 rows), then `out` of `light_left` (4 rows)."""
     zero, one = np.float32(0), np.float32(1)
-    for k in range(_BLOCK):
+    for k in range(BLOCK_BINS):
         p = begin + k
-        shown = rows[5 * _BLOCK + k]
+        shown = rows[5 * BLOCK_BINS + k]
         r = seen[p] - gain[p] * shown
         far = max(abs(r) / reach[p] - _TRUSTED, zero) / (one - _TRUSTED) if reach[p] > zero else one
         w = (one - min(far, one) ** 2) ** 2
         left = w * r * edge[p] * gain[p]
         for j in range(5):
-            rows[j * _BLOCK + k] *= left
-        rows[5 * _BLOCK + k] = r
-        rows[6 * _BLOCK + k] = w
-        rows[7 * _BLOCK + k] = left * shown
-        rows[8 * _BLOCK + k] = w * edge[p] * shown * shown
+            rows[j * BLOCK_BINS + k] *= left
+        rows[5 * BLOCK_BINS + k] = r
+        rows[6 * BLOCK_BINS + k] = w
+        rows[7 * BLOCK_BINS + k] = left * shown
+        rows[8 * BLOCK_BINS + k] = w * edge[p] * shown * shown
 
 
 @kernel
-def _block(b, base, turn, light, maps, offset, response, rows):  # type: ignore[no-untyped-def]
+def _block(b, base, light, slow, offset, response, changes, shifts, planes, rows):  # type: ignore[no-untyped-def]
     """`_light` of block b."""
-    cells, planes = slice(b * _CELLS, b * _CELLS + _CELLS), rows.reshape(-1, _BINS, _CELLS)
-    for k in range(2):
-        _spread(turn[k, 0, cells], turn[k, 1, cells], turn[k, 2, cells], offset[b], planes[k])
-    for k in range(3):
-        _spread(maps[k, 0, cells], maps[k, 1, cells], maps[k, 2, cells], offset[b], planes[2 + k])
-    _light(rows, base, light, response, b * _BLOCK)
+    squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
+    for k in range(5):
+        at, factors = _AT[k], changes[max(k - 1, 0)]
+        combine(slow[b, at : at + factors.size], factors, shifts[k] if k < 2 else np.float32(1), planes)
+        spread(planes, offset[b], squares[k])
+    _light(rows, base, light, response, b * BLOCK_BINS)
 
 
 @kernel
-def light_waves(base, turn, light, maps, offset, response, out):  # type: ignore[no-untyped-def]
+def light_waves(base, light, slow, offset, response, changes, shifts, out):  # type: ignore[no-untyped-def]
     """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y and of all.
 
     Arguments as in `light_left`.
     """
-    rows = np.empty(6 * _BLOCK, np.float32)
+    rows, planes = np.empty(6 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
     for b in range(offset.shape[0]):
-        _block(b, base, turn, light, maps, offset, response, rows)
-        for k in range(6):
-            _copy(rows[k * _BLOCK :], out[k, b * _BLOCK : b * _BLOCK + _BLOCK])
+        _block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
+        out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(6, BLOCK_BINS)
 
 
 @kernel
-def light_left(base, turn, light, maps, offset, response, edge, gain, seen, reach, pull, out):  # type: ignore[no-untyped-def]
+def light_left(base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out):  # type: ignore[no-untyped-def]
     """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a relative change of all
-    light and e w times its square; and of their N cells in `pull` (5, 3, N) moments of e w r times the others.
+    light and e w times its square; and in `right` (4, 36) the sums of e w r times the derivatives by `changes`.
 
-    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y, `turn` (2, 3, N) and `maps` (3, 3, N) the planes of their
-    changes, `offset` as in `Cells`, `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends;
-    0 leaves out. All are of single precision, or no vector units are used.
+    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by `changes` (4, 36), of
+    the surface's parameters and of the maps of A, B_x, B_y, times `slow`, as in `Cells.blocks`; `offset` as in
+    `Cells`. `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends; 0 leaves out. All but
+    `right` are of single precision and without gaps, or no vector units are used.
     """
-    rows = np.empty(9 * _BLOCK, np.float32)
-    planes = rows.reshape(-1, _BINS, _CELLS)
+    rows, planes = np.empty(9 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
+    squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
+    right[:] = 0
     for b in range(offset.shape[0]):
-        cells = slice(b * _CELLS, b * _CELLS + _CELLS)
-        _block(b, base, turn, light, maps, offset, response, rows)
-        _weigh(rows, edge, gain, seen, reach, b * _BLOCK)
+        _block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
+        _weigh(rows, edge, gain, seen, reach, b * BLOCK_BINS)
+        out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(9, BLOCK_BINS)[5:]
         for k in range(5):
-            _moments(planes[k], offset[b], pull[k, 0, cells], pull[k, 1, cells], pull[k, 2, cells])
-        for k in range(4):
-            _copy(rows[(5 + k) * _BLOCK :], out[k, b * _BLOCK : b * _BLOCK + _BLOCK])
+            at, sums = _AT[k], right[max(k - 1, 0)]
+            moments(squares[k], offset[b], planes)
+            project(slow[b, at : at + sums.size], planes, sums)
 
 
 def scene_of(

@@ -227,7 +227,7 @@ class Squares:
         self._whole = self._count > 0.5 * np.median(self._count)  # at the rim a part shows no whole fringe
         self._light_adu = scene.light_adu[0].astype(np.float32)
         waves = (scene.light_adu[1:] * np.exp(1j * scene.phase_rad(scene.surface))).astype(np.complex64)
-        swing = np.sum((scene.light_adu[1:] / self._light_adu) ** 2, axis=0, dtype=np.float32)
+        swing: Singles = np.sum((scene.light_adu[1:] / self._light_adu) ** 2, axis=0, dtype=np.float32)
         means = self._means(self._light_adu, swing, *waves.real, *waves.imag)
         self._level, self._swing = means[0], np.sqrt(means[1] / 2)
         self._fringe = np.hypot(means[2:4], means[4:]).sum(axis=0) / self._level  # that does not average out

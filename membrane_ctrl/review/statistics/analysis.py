@@ -114,10 +114,7 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     start_s, end_s : float
         Seconds of the run.
 
-    Raises
-    ------
-    InputError
-        If the part has no ticks.
+    Raises InputError if the part has no ticks.
     """
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
@@ -176,10 +173,7 @@ def _series(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
 def slow_spectrum(time_s: Column, means: Column) -> spectra.Spectrum:
     """Spectrum of 1 s means in segments half as long as the longest gapless stretch: three in a whole hold.
 
-    Parameters
-    ----------
-    time_s, means : (n,) arrays
-        Middles of the seconds, and means; gaps up to 5 s are bridged.
+    `time_s` (n,) are the middles of the seconds; gaps up to 5 s are bridged.
     """
     if not time_s.size:
         return spectra.power_spectrum(np.empty(0), 1.0)

@@ -41,10 +41,7 @@ def slope(time_s: Column, values: Column) -> FittedSlope:
     every r_k, which is put back, with g from the round before. An interval of 95 % then covers 94 to 97 % of
     long records, and 90 % of those of six correlation times.
 
-    Parameters
-    ----------
-    time_s, values : (n,) arrays
-        Equally spaced except for gaps; values that are not finite are ignored.
+    `time_s` (n,) is equally spaced except for gaps; values that are not finite are ignored.
     """
     there = np.isfinite(values)
     hours, values = time_s[there] / 3600.0, values[there]
