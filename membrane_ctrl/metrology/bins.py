@@ -132,12 +132,12 @@ class Cells:
         square = index // columns // _SIDE * columns + index % columns // _SIDE
         order = np.argsort(square, kind="stable")
         _, starts, counts = np.unique(square[order], return_index=True, return_counts=True)
-        place = np.arange(CELL_BINS)
-        bin_of = starts[:, None] + np.where(counts[:, None] > place, place, 0)
-        more = -len(starts) % BLOCK_CELLS
-        blocks = np.pad(bin_of, ((0, more), (0, 0)), "edge").reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
-        counted = (
-            np.pad(counts[:, None] > place, ((0, more), (0, 0))).reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
+        counted = counts[:, None] > np.arange(CELL_BINS)
+        first = starts[:, None] + np.arange(CELL_BINS) * counted
+        more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
+        blocks, counted = (
+            np.pad(each, more, mode).reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
+            for each, mode in ((first, "edge"), (counted, "constant"))
         )
         index = index[order][blocks]
         at = np.stack([index % columns, index // columns], axis=1)

@@ -70,9 +70,16 @@ def test_fringes_that_tell_nothing_are_refused(reference: SetFigure, periods: in
 
 
 @pytest.fixture(scope="module")
-def bench(reference: SetFigure) -> Bench:
+def prepared(reference: SetFigure) -> Bench:
     scene = scene_of(reference.head.optics, reference.checked, reference.figure, 12.455)
     return Bench(scene, Tracker(scene, SIZE, 255, OPTICS.camera.noise_adu))
+
+
+@pytest.fixture
+def bench(prepared: Bench) -> Bench:
+    """Its pictures are the same in whatever order the tests run."""
+    prepared.taken = 0
+    return prepared
 
 
 def test_no_bin_of_a_scene_counts_twice(bench: Bench) -> None:
@@ -146,14 +153,19 @@ def test_the_drift_is_that_of_the_mean_place_of_five_steps(bench: Bench) -> None
 
 def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> None:
     """They were those of the whole mirror, up to 16 times too small."""
-    tracker = bench.tracker()
-    pictures = [bench.frame(), bench.frame(), hand(bench.frame(), 46), bench.frame()]
-    _, before, covered, after = [tracker.follow(one, STILL, 0.1 * k) for k, one in enumerate(pictures)]
-    assert covered.verdict == "degraded", covered.reason
-    assert covered.sag_sigma_um > 1.2 * before.sag_sigma_um
-    assert np.median(covered.sigma_um[1:] / before.sigma_um[1:]) > 1.01  # from picture to picture 1.03 to 1.24
-    assert np.abs((covered.coeffs_um - before.coeffs_um)[1:] / covered.sigma_um[1:]).max() < 5
-    assert after.sag_sigma_um == pytest.approx(before.sag_sigma_um, rel=0.2)
+    grown = []
+    for _ in range(5):
+        tracker = bench.tracker()
+        pictures = [bench.frame(), bench.frame(), hand(bench.frame(), 46), bench.frame()]
+        _, before, covered, after = [tracker.follow(one, STILL, 0.1 * k) for k, one in enumerate(pictures)]
+        assert covered.verdict == "degraded", covered.reason
+        assert np.abs((covered.coeffs_um - before.coeffs_um)[1:] / covered.sigma_um[1:]).max() < 5
+        terms = np.median(covered.sigma_um[1:] / before.sigma_um[1:])
+        grown.append([covered.sag_sigma_um / before.sag_sigma_um, terms, after.sag_sigma_um / before.sag_sigma_um])
+    sag, terms, back = np.mean(grown, axis=0)  # from picture to picture they scatter by 0.12, 0.06 and 0.08
+    assert sag > 1.15
+    assert terms > 1.05
+    assert back == pytest.approx(1.0, abs=0.1)
 
 
 def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
@@ -198,6 +210,12 @@ def hand(frame: NDArray[np.uint8], columns: int, light_adu: float = 9) -> NDArra
     return out
 
 
+def dusty(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An eighth of the pixels darker by a fifth."""
+    spots = np.random.default_rng(8).random(SIZE) < 0.12
+    return np.where(spots, 0.8 * frame, frame).astype(np.uint8)
+
+
 def test_a_fit_that_stays_lost_knows_no_forgotten_bands(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """A brighter frame may be lost and yet be accepted: bands that were forgotten then ended the acquisition."""
     tracker, rows = bench.tracker(), np.arange(SIZE[0])[:, None]
@@ -223,6 +241,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "grey hand": lambda: hand(bench.frame(), 36, float(np.median(bench.scene.light_adu[0]))),
         "large grey hand": lambda: hand(bench.frame(), 44, float(np.median(bench.scene.light_adu[0]))),
         "body": lambda: hand(bench.frame(), 100),
+        "dust": lambda: dusty(bench.frame()),
         "dark": lambda: bench.frame(gain=0.1),
         "bright": lambda: bench.frame(gain=2.5),
         "exposure": lambda: bench.frame(gain=0.85),
@@ -247,6 +266,7 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("grey hand", "degraded", "covered"),
         ("large grey hand", "rejected", "covered or order lost"),
         ("body", "rejected", "covered"),
+        ("dust", "rejected", "covered or order lost"),
         ("dark", "rejected", "dark"),
         ("bright", "rejected", "saturated"),
         ("exposure", "degraded", "exposure changed"),

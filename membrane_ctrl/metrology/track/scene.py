@@ -94,9 +94,6 @@ class CrossedScene:
         return np.asarray(2 * self.light_adu[1:].sum(axis=0) * bent)
 
 
-# As in `bins`: small loops over the rows of a block, all in one array.
-
-
 @kernel
 def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
     """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of phases and maps."""

@@ -205,6 +205,8 @@ def fit_fault(fit: FrameFit, rest: float, out: float) -> Finding | None:
     """Whether a fit has failed: `rest` over the swing of the fringes is left, `out` of the bins have no weight."""
     if not fit.converged or rest > REST_REJECTED or out > _OUT_REJECTED:
         left = f"the fit leaves {rest:.0%} of the fringes, {out:.0%} of the bins do not fit"
+        if fit.converged and rest <= REST_REJECTED:
+            return Finding("rejected", f"covered or order lost: {left}", True)
         return Finding("rejected", f"order lost: the mirror moved too far since the last good frame ({left})", True)
     contrast = float(np.min(1 + fit.light[1:, 0]) / (1 + fit.light[0, 0]))  # of the first term, 1 everywhere
     if contrast < -_CONTRAST:
