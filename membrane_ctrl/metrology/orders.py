@@ -47,19 +47,10 @@ def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
 
 
 def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray, IntArray]:
-    """Continuous phase of each connected region, up to whole periods.
+    """Continuous phase (H, W) of each connected region, up to whole periods, and the number (H, W) of the region.
 
-    Parameters
-    ----------
-    wrapped_rad, mask : (H, W) arrays
-        Phase, and where to trust it. Neighbours must differ by less than half a period.
-
-    Returns
-    -------
-    phase_rad : (H, W) array
-        NaN outside the mask.
-    region : (H, W) int array
-        Number of the region, -1 outside the mask.
+    `mask` (H, W) is where the phase is trusted; outside they are NaN and -1. Neighbours must differ by less than half
+    a period.
     """
     out = np.full(wrapped_rad.shape, np.nan)
     region = np.full(wrapped_rad.shape, -1, np.int64)

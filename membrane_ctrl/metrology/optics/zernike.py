@@ -82,12 +82,18 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
     return np.asarray(np.tensordot(coeffs, monomial_table(), axes=1))
 
 
-def values(x: FloatArray, y: FloatArray) -> FloatArray:
-    """All terms, (36, ...), at points of the unit disc."""
+def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
+    """All terms, (36, ...), at points of the unit disc; or the polynomials of a table like theirs."""
+    table = monomial_table() if table is None else table
     p, q = np.array([(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]).T
     powers_x = np.stack([x**k for k in range(DEGREE + 1)])
     powers_y = np.stack([y**k for k in range(DEGREE + 1)])
-    return np.asarray(np.tensordot(monomial_table()[:, p, q], powers_x[p] * powers_y[q], axes=1))
+    return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
+
+
+def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """d/dx and d/dy of all terms, each (36, ...), at points of the unit disc."""
+    return values(x, y, differentiate(monomial_table(), 1)), values(x, y, differentiate(monomial_table(), 2))
 
 
 def differentiate(table: FloatArray, axis: int) -> FloatArray:
