@@ -135,10 +135,8 @@ class Cells:
         counted = counts[:, None] > np.arange(CELL_BINS)
         first = starts[:, None] + np.arange(CELL_BINS) * counted
         more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
-        blocks, counted = (
-            np.pad(each, more, mode).reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2)
-            for each, mode in ((first, "edge"), (counted, "constant"))
-        )
+        padded = np.pad(first, more, "edge"), np.pad(counted, more)
+        blocks, counted = (each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded)
         index = index[order][blocks]
         at = np.stack([index % columns, index // columns], axis=1)
         offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
