@@ -69,7 +69,7 @@ def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: igno
 def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
     """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to `saturated`.
 
-    `line` (2, width) is memory of a type that holds the sum of a bin's pixels, unless its side is odd.
+    `line` (2, width) is memory of a type that holds the sum of a bin's pixels.
     """
     width = line.shape[1]
     for row in range(start, stop):

@@ -1,9 +1,11 @@
 """How the package's loops are compiled."""
 
+import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,26 +18,29 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},
 }
+_FOLDER = Path(__file__).parents[1]  # of all kernels
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
-    return _recompiled_if_unreadable(njit(**_OPTIONS)(function))
+    return _recompiled_if_stale(njit(**_OPTIONS)(function))
 
 
 def step(function: Callable[..., Any]) -> Any:
     """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no vector units."""
-    return _recompiled_if_unreadable(njit(forceinline=True, **_OPTIONS)(function))
+    return _recompiled_if_stale(njit(forceinline=True, **_OPTIONS)(function))
 
 
-def _recompiled_if_unreadable(dispatcher: Any) -> Any:
-    """Let an index of the cache that cannot be read count as empty; Numba raises.
+def _recompiled_if_stale(dispatcher: Any) -> Any:
+    """Let an index of the cache that is of other sources, or that cannot be read, count as empty.
 
-    It names the classes of arguments by their modules, which the version that wrote it may have had elsewhere, and it
-    may have been cut by a power failure.
+    A kernel contains the kernels that it calls, but Numba looks for changes only in its own file. And it raises if an
+    index was cut by a power failure, or names the classes of arguments by modules that are gone.
     """
     file = getattr(dispatcher._cache, "_cache_file", None)  # None where no folder is writable
     if file is not None:
+        source = Path(dispatcher.py_func.__code__.co_filename)
+        file._source_stamp = file._source_stamp, _sources(_FOLDER if _FOLDER in source.parents else source.parent)
         load = file._load_index
 
         def load_index() -> dict[Any, str]:
@@ -48,6 +53,13 @@ def _recompiled_if_unreadable(dispatcher: Any) -> Any:
 
         file._load_index = load_index
     return dispatcher
+
+
+@cache
+def _sources(folder: Path) -> int:
+    """Checksum of the kernels in a folder."""
+    texts = [path.read_bytes() for path in sorted(folder.rglob("*.py"))]
+    return zlib.crc32(b"".join(text for text in texts if b"@kernel" in text or b"@step" in text))
 
 
 # Two threads of our own for kernels that release the interpreter lock.

@@ -132,17 +132,11 @@ class FrameFitter:
         return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM, bands)
 
     def _evaluate(
-        self,
-        seen_adu: Singles,
-        shifts_rad: Shifts,
-        shape: Surface,
-        light: FloatArray,
-        bands: FloatArray,
-        reach: Singles,
+        self, seen: Singles, shifts_rad: Shifts, shape: Surface, light: FloatArray, bands: FloatArray, reach: Singles
     ) -> None:
         """Residual, weights and what the right side is made of, at a surface, maps of light and bands."""
         known = self.scene.edge, self.bands.gain(bands)
-        light_left(*self._shown(shifts_rad, shape, light), *known, seen_adu, reach, self._pull, self._out)
+        light_left(*self._shown(shifts_rad, shape, light), *known, seen, reach, self._pull, self._out)
 
     def rows(self) -> FloatArray:
         """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
