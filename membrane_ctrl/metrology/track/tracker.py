@@ -97,14 +97,15 @@ class Tracker:
         """Take light, swings and phases of each bin from five steps of the pattern or more; the film moves little.
 
         Frames, `shifts_rad` (frames, 2), `time_s` and `displacement_um` (frames,) are those of `follow`. Returns the
-        frames' figures; if one of them is rejected, the light remains that of the reference.
+        frames' figures; if one is rejected or partly covered, the light remains that of the reference.
         """
         found, fits, seen = [], [], []
         for frame, (x, y), at_s, reading in zip(frames, shifts_rad, time_s, displacement_um, strict=True):
             found.append(self.follow(frame, (float(x), float(y)), float(at_s), float(reading)))
             fits.append(self._last)
             seen.append(self._clear)
-        if any(frame.verdict == "rejected" for frame in found):
+        used = [frame.used_share for frame in found]  # 0 where rejected
+        if not min(used) > max(max(used) - _OTHER_BINS, 0):  # what a hand covers in one has light in none
             return found
         if self._bands.recall():
             self._begin(self._fitter.scene, self._last.surface, self._last.light)
