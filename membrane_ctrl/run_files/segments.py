@@ -181,9 +181,7 @@ def ending(path: Path) -> tuple[bool, int]:
     """Whether consecutive messages reach the end of a closed file, and else the bytes after the last complete one.
 
     Does not read the content of messages. Rerun takes a file that ends between two messages, or within the head of
-    one, as whole.
-
-    Raises OSError.
+    one, as whole. Raises OSError.
     """
     found, size = whole_messages(path), path.stat().st_size
     behind = size - (found[-1].end if found else 0)

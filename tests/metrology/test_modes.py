@@ -28,6 +28,16 @@ def test_lines_beyond_half_the_frame_rate_are_named(seed: int) -> None:
         assert seen.aliases_hz == ()
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_frames_of_a_busy_machine_name_the_lines_as_well(seed: int) -> None:
+    """Intervals that scatter by some per cent were no steady rate: nothing was searched."""
+    time_s, coeffs_um, planted = watched(seed, jitter_s=2e-3)
+    found = find_modes(time_s, coeffs_um)
+    assert found is not None
+    assert len(found) == len(planted)
+    assert all(mode.seen_by(found) for mode in planted)
+
+
 def test_lines_with_one_alias_at_one_rate_make_no_others() -> None:
     """A drum's, which move the vertex: at 17.1 frames a second, 27 and 61 Hz are at 7.2 and 7.4 Hz."""
     time_s, coeffs_um, planted = watched(1, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, drums=True)

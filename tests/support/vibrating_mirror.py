@@ -72,13 +72,15 @@ def watched(
     amplitude_nm: float = 5.0,
     drums: bool = False,
     drift_nm: float = 1.0,
+    jitter_s: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, list[Planted]]:
     """Times, terms in um and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
 
-    Frequencies and shapes are drawn, unless they are a drum's.
+    Frequencies and shapes are drawn, unless they are a drum's. `jitter_s` is that of the times of the frames.
     """
     rng = np.random.default_rng(seed)
     t = frame_times_s(rates_hz, seconds)
+    t = t + jitter_s * np.random.default_rng((seed, 1)).normal(size=t.size)
     mixed = np.linalg.qr(rng.normal(size=(36, 36)))[0]
     terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed
     terms_nm += drift_nm * np.cumsum(rng.normal(size=(t.size, 36)), axis=0)

@@ -62,11 +62,10 @@ def _sources(folder: Path) -> int:
     return zlib.crc32(b"".join(text for text in texts if b"@kernel" in text or b"@step" in text))
 
 
-# Two threads of our own for kernels that release the interpreter lock.
-#
-# The kernels are plain compiled loops over [start, stop). Splitting them here, instead of in the compiler's parallel
-# loops, keeps idle threads asleep (the control loop shares the machine), avoids a library that only one thread may
-# enter, and adds partial sums in a fixed order, so that results repeat to the last bit.
+# Two threads of our own for kernels that release the interpreter lock: plain compiled loops over [start, stop).
+# Splitting them here, instead of in the compiler's parallel loops, keeps idle threads asleep (the control loop shares
+# the machine), avoids a library that only one thread may enter, and adds partial sums in a fixed order, so that
+# results repeat to the last bit.
 
 T = TypeVar("T")
 WORKERS = 2

@@ -32,6 +32,7 @@ _GRID = 4  # frequencies per resolution
 _TAKEN = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # resolutions about a line that go with it: it may be damped
 _SHORTEST = 0.6  # shorter frames of one rate, in pieces, are left out
 _GRAIN_UM = 1e-3  # of a hold's terms: they have at least the noise of rounding
+_HALF, _OTHER_RATE = 12, 0.04  # intervals on each side, and change of their median; busy machines scatter by as much
 _GAP = 4.5  # intervals: as long a pause ends a piece
 _MOST = 24
 _CHANCE = 1e-9  # of a false line in one search
@@ -183,10 +184,12 @@ def _runs(time_s: FloatArray) -> list[slice]:
     from scipy import ndimage
 
     intervals = np.diff(time_s)
-    if intervals.size < 10:
+    if intervals.size <= 2 * _HALF:
         return []
-    usual = ndimage.median_filter(intervals, 9, mode="nearest")
-    ends = np.flatnonzero((np.abs(np.diff(usual)) > 0.01 * usual[1:]) | (intervals[1:] > _GAP * usual[1:])) + 1
+    usual = ndimage.median_filter(intervals, 2 * _HALF + 1, mode="nearest")
+    other = np.append(0, np.abs(usual[2 * _HALF :] / usual[: -2 * _HALF] - 1) > _OTHER_RATE)
+    begins, ceases = (np.flatnonzero(np.diff(np.append(other, 0)) == sign) for sign in (1, -1))
+    ends = np.union1d((begins + ceases) // 2 + _HALF, np.flatnonzero(intervals > _GAP * usual))
     pieces = []
     for first, last in pairwise([0, *(ends + 1), time_s.size]):
         lasts_s = time_s[last - 1] - time_s[first]
