@@ -137,8 +137,7 @@ class Cells:
         more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
         padded = np.pad(first, more, "edge"), np.pad(counted, more)
         blocks, counted = (each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded)
-        index = index[order][blocks]
-        at = np.stack([index % columns, index // columns], axis=1)
+        at = np.stack([(index := index[order][blocks]) % columns, index // columns], axis=1)
         offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
         return index.ravel(), counted.ravel(), Cells(offset)
 

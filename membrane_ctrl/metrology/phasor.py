@@ -143,8 +143,8 @@ class Binner:
                 pixels = np.ascontiguousarray(frame)
                 _bin_rows(pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop)
 
-        fewest = 0 if len(frames) > 1 else self._size[0] + 1  # to wake a thread costs more than half a frame
-        split(run, self.sums.shape[1], fewest)
+        # waking a thread costs more than half a frame
+        split(run, self.sums.shape[1], self._size[0] + 1 if len(frames) == 1 else 0)
 
 
 @dataclass(frozen=True)

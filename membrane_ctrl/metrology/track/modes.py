@@ -187,7 +187,8 @@ def _runs(time_s: FloatArray) -> list[slice]:
     if intervals.size <= 2 * _HALF:
         return []
     usual = ndimage.median_filter(intervals, 2 * _HALF + 1, mode="nearest")
-    other = np.append(0, np.abs(usual[2 * _HALF :] / usual[: -2 * _HALF] - 1) > _OTHER_RATE)
+    before, after = usual[: -2 * _HALF], usual[2 * _HALF :]
+    other = np.append(0, np.abs(after - before) > _OTHER_RATE * before)
     begins, ceases = (np.flatnonzero(np.diff(np.append(other, 0)) == sign) for sign in (1, -1))
     ends = np.union1d((begins + ceases) // 2 + _HALF, np.flatnonzero(intervals > _GAP * usual))
     pieces = []
