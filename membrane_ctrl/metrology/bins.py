@@ -137,7 +137,8 @@ class Cells:
         more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
         padded = np.pad(first, more, "edge"), np.pad(counted, more)
         blocks, counted = (each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded)
-        at = np.stack([(index := index[order][blocks]) % columns, index // columns], axis=1)
+        index = index[order][blocks]
+        at = np.stack([index % columns, index // columns], axis=1)
         offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
         return index.ravel(), counted.ravel(), Cells(offset)
 
@@ -182,8 +183,8 @@ class Cells:
         return np.ascontiguousarray(every.transpose(2, 0, 1, 3)).reshape(len(self.offset), -1, 3 * BLOCK_CELLS)
 
 
-# One small loop a function, and the rows of a block in one array: so the compiler can tell that nothing overlaps, and
-# finds vector instructions on any processor. A block's planes stay in the second cache from the light to its sums.
+# The same for one block, compiled. One small loop a function, and a block's rows in one array: so the compiler can tell
+# that nothing overlaps, and finds vector instructions on any processor. A block's planes stay in the second cache.
 
 
 @kernel

@@ -75,7 +75,7 @@ class FrameFitter:
         self._cells = scene.cells
         self.jacobian = self._cells.planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
         self._basis = self._cells.planes(scene.basis)
-        self._light_adu = scene.light_adu.astype(np.float32)
+        self.light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
         self._base = _reduced(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
@@ -149,7 +149,7 @@ class FrameFitter:
             self._traced, moved = shape, np.zeros(PARAMETERS)
             self._base = _reduced(self.scene.phase_rad(shape))
         changes, shifts = np.vstack([moved, light]).astype(np.float32), np.array(shifts_rad, np.float32)
-        return self._base, self._light_adu, self._slow, self._cells.offset, self._response, changes, shifts
+        return self._base, self.light_adu, self._slow, self._cells.offset, self._response, changes, shifts
 
     def _right(self) -> FloatArray:
         """J^T W r (144 + 2 k,) of the last evaluation."""

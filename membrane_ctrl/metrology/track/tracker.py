@@ -81,7 +81,6 @@ class Tracker:
     def _begin(self, scene: CrossedScene, shape: surface.Surface, light: FloatArray) -> None:
         """Start from a scene, a surface and maps (3, 36) of light."""
         none, all_bins = np.zeros(scene.index.size, np.float32), np.ones(scene.index.size, np.float32)
-        self._level_adu = scene.light_adu[0].astype(np.float32)
         self._swing_adu = float(np.median(scene.light_adu[1]))
         self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
         self._last = FrameFit(shape, light, none, all_bins, True)
@@ -287,7 +286,7 @@ class Tracker:
         """Fit without outliers, at first of the last frame's scale: a film that moved needs all bins to begin."""
         fit = start
         # light wanders in proportion to itself: bright fringes in a bright patch are no outliers
-        bright = np.maximum(seen / self._level_adu, np.float32(1)) * ~left_out
+        bright = np.maximum(seen / self._fitter.light_adu[0], np.float32(1)) * ~left_out
         for first in filter(None, (self._scale_adu, _FIRST_REACH)):
             fit, scale = start, first
             for _ in range(4):
