@@ -183,8 +183,8 @@ class Cells:
         return np.ascontiguousarray(every.transpose(2, 0, 1, 3)).reshape(len(self.offset), -1, 3 * BLOCK_CELLS)
 
 
-# The same for one block, compiled. One small loop a function, and a block's rows in one array: so the compiler can tell
-# that nothing overlaps, and finds vector instructions on any processor. A block's planes stay in the second cache.
+# The same for one block, compiled. One small loop a function, and a block's rows in one array: so the compiler can
+# tell that nothing overlaps, and finds vector instructions on any processor. A block's planes fit the second cache.
 
 
 @kernel
