@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from firmware_iface.roles import BenchReading
@@ -37,10 +39,21 @@ class Seconds:
         for _ in range(seconds):
             self.now_s += 1.0
             reading = BenchReading(0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0)
-            inputs = TickInputs(self.now_s, 1.0, reading, estimate=self._shape() if camera else None)
-            self.events += self.consistency.ask(
-                inputs, state, 1.0, HoldStatus(0.0, gauge_pa, 0.0, 0.0, 0.0, leak_um_per_s, leak_um_per_s, bleed)
+            figure = self._shape() if camera else None
+            inputs = TickInputs(self.now_s, 1.0, reading, estimate=figure)
+            held = HoldStatus(
+                laser_um=0.0,
+                gauge_pressure_pa=gauge_pa,
+                setpoint_um=0.0,
+                trim_um=0.0,
+                ramp_left_um=0.0,
+                leak_um_per_s=leak_um_per_s,
+                flow_um_per_s=leak_um_per_s,
+                bleed_fraction=bleed,
+                sag_um=math.nan if figure is None else figure.sag_um,
+                figure=figure,
             )
+            self.events += self.consistency.ask(inputs, state, 1.0, held)
 
     def _shape(self) -> ShapeEstimate:
         nothing = np.zeros(36)
