@@ -100,7 +100,7 @@ class Controller:
             locked=scene.latched,
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            optics_hold=self._config.by_optics or self._holders.optics_hold,
+            optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
         )
         verdict = self._safety.judge(self.state, observation)

@@ -137,6 +137,11 @@ class FigureGate:
         return self._newest_sag_um if self._sound and self.newest_age_s <= self._guard_age_s else math.nan
 
     @property
+    def zero_um(self) -> float:
+        """Sag at displacement 0, um; NaN until sag and laser have been compared."""
+        return self._zero_um.value
+
+    @property
     def guard_um(self) -> float:
         """Displacement by which range and limits may be judged, um; NaN without one."""
         return self.sag_um - self._zero_um.value

@@ -32,7 +32,7 @@ class Observer:
     reading : BenchReading or None
         This tick's reading.
     laser_um : float
-        The laser's reading, if it is new, of good quality and no jump; NaN without one, and on a bench that uses none.
+        The laser's reading, if it is new, of good quality and no jump; NaN without one, or on a bench that uses none.
     displacement_um : float
         The displacement that the loop may use: the laser's, or that of the figures if the loop may follow the optics
         and the laser has none; NaN without either.
@@ -41,6 +41,8 @@ class Observer:
         ago as well.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
+    optics_replace_laser : bool
+        Those two are by figures: the laser is missing or stuck, or not used.
     figures : FigureGate
         The figures that may be used.
     commanded : tuple of float
@@ -62,6 +64,7 @@ class Observer:
         self.commanded = (0.0, 0.0)
         self.reading: BenchReading | None = None
         self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
+        self.optics_replace_laser = False
 
     def wrote(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
@@ -79,12 +82,13 @@ class Observer:
             if self._stamp is None or (stamp[0] != self._stamp[0] and stamp[1] != self._stamp[1]):
                 self._last_advance_s = now_s
                 self._stamp = stamp
-        fresh = self._last_advance_s == now_s and not self._by_optics
-        self.laser_um = self._gate(reading, fresh)
+        uses_laser = not self._by_optics
+        self.laser_um = self._gate(reading, fresh=self._last_advance_s == now_s and uses_laser)
         same_s = self._laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
         self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
+        self.optics_replace_laser = False
         if self._follows_optics and math.isnan(self.moving_laser_um):
             self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
@@ -95,6 +99,7 @@ class Observer:
         if self.laser_stuck and math.isnan(self.figures.guard_um):
             return
         self.displacement_um, self.guard_um = self.figures.loop_um, self.figures.guard_um
+        self.optics_replace_laser = math.isfinite(self.guard_um)
 
     @property
     def laser_stuck(self) -> bool:

@@ -1,7 +1,7 @@
 """Notices that a sensor of the film is lost while the others still hold the mirror. Pure."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 
 from membrane_ctrl.config.schema import Config
@@ -57,8 +57,7 @@ class RedundancyWatch:
         """
         if not moving:
             over = [
-                MaintenanceOver(notice_name(sensor), "the hold has ended")
-                for sensor in sorted_sensors(self._reported)
+                MaintenanceOver(name_notice(sensor), "the hold has ended") for sensor in sort_sensors(self._reported)
             ]
             self._forget()
             return [*over]
@@ -79,7 +78,7 @@ class RedundancyWatch:
         self._reported.add(sensor)
         left = [other for other in self._present_s if other not in self._reported]
         message = f"the {sensor.value} is lost; {self._describe(left)}. Find out why before another sensor fails"
-        return [Maintenance(notice_name(sensor), message)]
+        return [Maintenance(name_notice(sensor), message)]
 
     def _return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
         if sensor not in self._reported:
@@ -89,21 +88,21 @@ class RedundancyWatch:
             return []
         self._reported.discard(sensor)
         del self._returned_s[sensor]
-        return [MaintenanceOver(notice_name(sensor), f"the {sensor.value} is back")]
+        return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} is back")]
 
     def _describe(self, left: list[FilmSensor]) -> str:
         """What still bounds the true displacement."""
-        holders = [sensor.value for sensor in sorted_sensors(left) if sensor is not FilmSensor.GAUGE]
+        holders = [sensor.value for sensor in sort_sensors(left) if sensor is not FilmSensor.GAUGE]
         if FilmSensor.GAUGE in left and holders:
             return f"{' and '.join(holders)} and gauge are left, and the gauge bounds an error to {self._bound}"
         return f"only {' and '.join(holders) or 'the gauge'} left, and no other sensor bounds an error"
 
 
-def notice_name(sensor: FilmSensor) -> str:
+def name_notice(sensor: FilmSensor) -> str:
     """Name of the maintenance notice for a lost sensor."""
     return f"{sensor.value}_lost"
 
 
-def sorted_sensors(sensors: "set[FilmSensor] | list[FilmSensor]") -> list[FilmSensor]:
+def sort_sensors(sensors: Collection[FilmSensor]) -> list[FilmSensor]:
     """The sensors in the order of their class."""
     return [sensor for sensor in FilmSensor if sensor in sensors]

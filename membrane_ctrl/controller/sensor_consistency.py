@@ -369,15 +369,15 @@ class Holders:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._sag_zero_um)
+            sag_zero_um = self._find_sag_zero_um(scene)
+            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, sag_zero_um)
             self._running = True
             for agreed in self._agreed_mounts.values():
                 agreed.reset(scene.trim_um)
             self._mount_drift.start(scene.trim_um)
             self._stand.lock()
-        if inputs.estimate is not None and inputs.estimate.kind == "full" and self._tracks:
-            if inputs.estimate.verdict != "rejected":
-                self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
+        if self._is_anchor(inputs.estimate):
+            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
         figure = self._select_figure(figures.accepted, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
@@ -404,6 +404,16 @@ class Holders:
             sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
             self.estimate = replace(self.estimate, sigma_um=sigma_um)
         return news
+
+    def _find_sag_zero_um(self, scene: Scene) -> float:
+        """Sag at which the true centre is at 0, where the optics replace the laser; NaN where they are to be locked."""
+        if self._by_optics:
+            return self._sag_zero_um
+        return scene.observer.figures.zero_um + scene.trim_um if scene.observer.optics_replace_laser else math.nan
+
+    def _is_anchor(self, figure: ShapeEstimate | None) -> bool:
+        """Whether a figure is a full set that the tracking's next frames count from."""
+        return figure is not None and self._tracks and figure.kind == "full" and figure.verdict != "rejected"
 
     def _select_figure(
         self, figure: ShapeEstimate | None, dt_s: float, shape: ShapeState, consistency: SensorConsistency
