@@ -409,7 +409,8 @@ class Holders:
         """Sag at which the true centre is at 0, where the optics replace the laser; NaN where they are to be locked."""
         if self._by_optics:
             return self._sag_zero_um
-        return scene.observer.figures.zero_um + scene.trim_um if scene.observer.optics_replace_laser else math.nan
+        observer = scene.observer
+        return observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
 
     def _is_anchor(self, figure: ShapeEstimate | None) -> bool:
         """Whether a figure is a full set that the tracking's next frames count from."""

@@ -1,4 +1,4 @@
-"""Protections follow whichever sensor shows the film: one sensor fails in virtual time, and the true mirror is judged."""
+"""Protections follow whichever sensor shows the film: one fails in virtual time, and the true mirror is judged."""
 
 from __future__ import annotations
 

@@ -130,3 +130,17 @@ def test_a_camera_that_repeats_one_shape_is_believed_neither_in_the_shape_nor_in
     mirror.camera_stuck = False
     mirror.pass_by(2, camera=True)
     assert mirror.consistency.camera_lies == ""
+
+
+def test_a_gauge_that_drifts_for_hours_against_the_laser_raises_one_notice_and_its_end() -> None:
+    mirror = Seconds()
+    mirror.pass_by(100)
+    for tenth in range(130):  # 0.1 Pa, 2 um, in 100 s: by 260 um
+        mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
+    notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
+    assert [event.kind for event in notices] == ["maintenance"]
+    assert mirror.consistency.laser_gauge_apart == ""
+    for tenth in range(130, 60, -1):
+        mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
+    notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
+    assert [event.kind for event in notices] == ["maintenance", "maintenance_over"]
