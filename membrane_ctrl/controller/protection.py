@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.redundancy import FilmSensor
 from membrane_ctrl.model.telemetry import State
 
@@ -94,6 +94,7 @@ _TIMES: Mapping[Activity, _Keepers] = {
     Activity.MANUAL: (Guard.MANUAL_TIME,),
     Activity.TUNE: (Guard.EXPERIMENT_TIME,),
 }
+_DEPTHS: _Keepers = ("over_displacement", "under_displacement")
 _HELD = frozenset({Activity.SETTLE, Activity.HOLD, Activity.PAUSE})
 
 
@@ -113,32 +114,35 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
     """
     uses_laser = process_value is not ProcessValue.OPTICS
     uses_optics = process_value is not ProcessValue.LASER
+    by_figures: _Keepers = (Guard.FIGURE_GATE,) if uses_optics else ()
+    by_laser: _Keepers
     match duty:
         case Duty.PRESSURE:
             return ("over_pressure", "pressure_missing", "gauge_stuck", "gauge_jump")
         case Duty.DEPTH:
-            shallow = ("under_displacement",) if activity.state is State.HOLD else ()
-            return ("over_displacement", *shallow)
+            return _DEPTHS if activity.state is State.HOLD else _DEPTHS[:1]
         case Duty.RANGE:
             return _MOTIONS[activity]
         case Duty.TIME:
             return _TIMES[activity]
         case Duty.MISSING:
-            by_figures = () if uses_laser else ("film_unseen",)
-            return ("displacement_missing", *by_figures)
+            return ("displacement_missing",) if uses_laser else ("displacement_missing", "film_unseen")
         case Duty.FROZEN:
             by_laser = ("displacement_frozen", "displacement_stuck") if uses_laser else ("displacement_frozen",)
-            return (*by_laser, *((Guard.FIGURE_GATE,) if uses_optics else ()), "laser_gauge_apart")
+            return (*by_laser, *by_figures, "laser_gauge_apart")
         case Duty.JUMP:
             by_laser = ("displacement_jump",) if uses_laser else ()
-            return (*by_laser, *((Guard.FIGURE_GATE,) if uses_optics else ()), "laser_gauge_apart")
+            return (*by_laser, *by_figures, "laser_gauge_apart")
         case Duty.GAUGE:
             return ("laser_gauge_apart", Guard.DRIFT_NOTICE)
         case Duty.MAJORITY:
             if activity not in _HELD or not uses_laser:
                 return ()
-            by_estimate = (Guard.ESTIMATE_ROBUST,) if uses_optics else ("laser_implausible",)
-            return (Guard.PLAUSIBILITY, *by_estimate, Guard.TRIM_LIMIT)
+            return (
+                Guard.PLAUSIBILITY,
+                Guard.ESTIMATE_ROBUST if uses_optics else "laser_implausible",
+                Guard.TRIM_LIMIT,
+            )
         case Duty.GAS:
             return ("gas_excess",) if activity.state is State.HOLD else ()
         case Duty.REDUNDANCY:
@@ -166,7 +170,7 @@ class Bound:
 _FAST_MOTION_UM = 65.0
 
 
-def find_bound(process_value: ProcessValue, failed: FilmSensor, failure: Failure, limits: LimitsConfig) -> Bound:
+def find_bound(process_value: ProcessValue, failed: FilmSensor, failure: Failure, config: Config) -> Bound:
     """What bounds the true displacement when one sensor fails, in every activity.
 
     Parameters
@@ -174,7 +178,8 @@ def find_bound(process_value: ProcessValue, failed: FilmSensor, failure: Failure
     process_value : ProcessValue
     failed : FilmSensor
     failure : Failure
-    limits : LimitsConfig
+    config : Config
+        Its limits and the trim's range.
 
     Returns
     -------
@@ -186,7 +191,8 @@ def find_bound(process_value: ProcessValue, failed: FilmSensor, failure: Failure
         return Bound(by, _FAST_MOTION_UM)
     optics_fail = failed is FilmSensor.OPTICS
     if optics_fail and process_value is not ProcessValue.OPTICS and failure in (Failure.DRIFT, Failure.HIDDEN):
-        return Bound(FilmSensor.LASER, 1.1 * TRIM_MAX_UM)
+        return Bound(FilmSensor.LASER, 1.1 * config.shape.trim_max_um)
+    limits = config.limits
     distances_um = {
         Failure.LOST: _FAST_MOTION_UM,
         Failure.STEP: limits.laser_gauge_apart_max_um + _FAST_MOTION_UM,
@@ -194,6 +200,3 @@ def find_bound(process_value: ProcessValue, failed: FilmSensor, failure: Failure
         Failure.HIDDEN: 1.3 * limits.laser_gauge_day_max_um,
     }
     return Bound(FilmSensor.GAUGE, distances_um[failure])
-
-
-TRIM_MAX_UM = 100.0  # the default of `shape.trim_max_um`

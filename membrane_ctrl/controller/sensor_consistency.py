@@ -406,7 +406,7 @@ class Holders:
         return news
 
     def _find_sag_zero_um(self, scene: Scene) -> float:
-        """Sag at which the true centre is at 0, where the optics replace the laser; NaN where they are to be locked."""
+        """Sag at true centre 0, where the optics replace the laser; NaN where they are to be locked."""
         if self._by_optics:
             return self._sag_zero_um
         observer = scene.observer

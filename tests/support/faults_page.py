@@ -115,7 +115,7 @@ def _protections() -> list[str]:
     for value in ProcessValue:
         for sensor in FilmSensor:
             if value is not ProcessValue.OPTICS or sensor is not FilmSensor.LASER:
-                cells = (find_bound(value, sensor, failure, Config().limits) for failure in Failure)
+                cells = (find_bound(value, sensor, failure, Config()) for failure in Failure)
                 bounds = " | ".join(f"{bound.distance_um:.0f} um ({bound.by.value})" for bound in cells)
                 lines.append(f"| {value.value} | {sensor.value} | {bounds} |")
     return lines
