@@ -104,10 +104,10 @@ def load_done() -> dict[Cell, Outcome]:
 
 
 def run_all(cells: Iterable[Cell], processes: int) -> dict[Cell, Outcome]:
-    """Run what is not done yet, slow cells first, and store each result."""
+    """Run what is not done yet, short cells first, and store each result."""
     done = load_done()
     wanted = list(cells)
-    todo = sorted((cell for cell in wanted if cell not in done), key=lambda cell: -cell.lasts_s)
+    todo = sorted((cell for cell in wanted if cell not in done), key=lambda cell: cell.lasts_s)
     RESULTS.parent.mkdir(exist_ok=True)
     with (
         RESULTS.open("a", encoding="utf-8") as file,
