@@ -135,9 +135,9 @@ def _pairs(pairs: Results) -> list[str]:
     far = {cell: outcome for cell, outcome in pairs.items() if abs(outcome.off_um) > NOTABLE_UM}
     lines = ["", "## Two sensors fail", ""]
     lines += [
-        f"Of {len(pairs)} pairs, drawn from a seed so that every failure meets one of each other sensor in",
-        f"each process value, {len(lost)} leave one sensor or none with a value; {len(lost) - len(late)} of them end in the",
-        f"safe state within `states.hold_flow_max_s` and the ramp ({allowed_s:.0f} s).",
+        f"Of {len(pairs)} pairs, drawn from a seed so that every failure meets one of each other sensor in each",
+        f"process value, {len(lost)} leave one sensor or none with a value; {len(lost) - len(late)} of them end",
+        f"in the safe state within `states.hold_flow_max_s` and the ramp ({allowed_s:.0f} s).",
         "",
     ]
     lines += ["Not within that time:", "", *map(_line, late.items()), ""] if late else []
@@ -153,9 +153,9 @@ def _weeks(weeks: Mapping[str, Week]) -> list[str]:
     """Weeks without a failure."""
     lines = ["", "## Weeks without a failure", ""]
     lines += [
-        "A room of +-2 K and +-10 % relative humidity a day (+235 um of the centre per 10 % at constant pressure),",
-        "a film that is warmer than its ring (57 um/K), creep and a gauge whose zero drifts by 1 Pa/K. Each day the hold",
-        "is paused, driven by hand, tuned, moved to another setpoint, lowered and inflated again",
+        "A room of +-2 K and +-10 % relative humidity a day (+235 um of the centre per 10 % at constant",
+        "pressure), a film that is warmer than its ring (57 um/K), creep and a gauge whose zero drifts by 1 Pa/K.",
+        "Each day the hold is paused, driven by hand, tuned, moved to another setpoint, lowered and inflated again",
         "(`tests/campaign/climate_week.py`).",
         "",
         "| process value | days | faults | notices |",
