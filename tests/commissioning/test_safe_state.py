@@ -14,7 +14,7 @@ import pytest
 
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.pump_board import BoardSample
-from firmware_iface.register_map import known_maps
+from firmware_iface.register_map import default_map, known_maps
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
@@ -78,7 +78,7 @@ class Bench:
 
 @pytest.fixture
 def version() -> int:
-    return 2
+    return default_map().map_version
 
 
 @pytest.fixture
