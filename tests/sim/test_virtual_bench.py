@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from firmware_iface.emulators.pump_board import StoredSettings
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import ALL_FAULTS, BenchCommand, LinkDownError, LinkError
 from membrane_ctrl.config.schema import Config, TwinConfig
@@ -14,6 +15,7 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(twin=TwinConfig(scenario="calm"))
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+GAUGE_LOST = default_map().fault_mask("gauge_lost")
 
 
 @pytest.fixture
@@ -122,3 +124,33 @@ def test_the_heartbeat_goes_round_and_keeps_the_watchdog_fed(bench: VirtualBench
         bench.advance(0.4)
         assert not bench.read().watchdog_tripped
     assert bench.board.pump_fraction == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_host_that_ignores_a_lost_gauge_is_stopped_by_the_board() -> None:
+    bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump))
+    bench.open()
+    bench.wrong.gauge_lost = True
+    for _ in range(800):
+        bench.write(BenchCommand(0.4, 0.0))
+        bench.advance(0.02)
+    reading = bench.read()
+    assert (reading.pump_fraction, reading.latched_faults) == (0.0, GAUGE_LOST)
+    stopped_um = bench.truth.displacement_um
+    bench.clear_faults(GAUGE_LOST)
+    for _ in range(800):
+        bench.write(BenchCommand(0.4, 0.0))
+        bench.advance(0.02)
+    assert bench.read().latched_faults == GAUGE_LOST
+    assert bench.truth.displacement_um < stopped_um
+
+
+@pytest.mark.parametrize(("fitted", "pump"), [(0b10, 0.0), (0b01, 0.4), (0, 0.4)])
+def test_an_open_circuit_is_read_and_stops_the_pump_where_it_is_fitted(fitted: int, pump: float) -> None:
+    bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump), stored=StoredSettings(interlocks_fitted=fitted))
+    assert bench.open().interlocks_fitted == fitted
+    bench.write(BenchCommand(0.4, 0.0))
+    assert bench.read().interlock_inputs == 0xFFFF
+    bench.wrong.open_interlocks = 0b10
+    bench.advance(0.02)
+    reading = bench.read()
+    assert (reading.pump_fraction, reading.interlock_inputs) == (pytest.approx(pump), 0xFFFD)
