@@ -271,7 +271,7 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
     return Sender(who, role, account, on_behalf.session, from_person)
 
 
-def may_not(sender: Sender, do: Action) -> str:
+def may_not(sender: Peer | Sender, do: Action) -> str:
     """Why the sender's role forbids this request; empty if it does not."""
     needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
     if _RANK[sender.role] >= _RANK[needed]:

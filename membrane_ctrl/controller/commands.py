@@ -32,9 +32,6 @@ DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
 # these can lift the mirror and are not obeyed in the same tick
 _OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack", "unlock"})
 
-# What only the start of a run reports: an earlier run resumed within the last day; a fault is still latched
-OF_START = frozenset({"resumed", "latched"})
-
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
 
@@ -43,7 +40,8 @@ RUNNING = MOVING | {State.STANDBY, State.CHECK}
 class Command:
     """A request of a person or program."""
 
-    # of `TABLE`, or of `OF_START`
+    # of `TABLE`, or what only the start of a run reports: an earlier run resumed within the last day, or a fault is
+    # still latched
     kind: Kind | Literal["resumed", "latched"]
     who: str  # recorded, as is `why`
     why: str = ""
@@ -127,7 +125,7 @@ def overruled(command: Command, obeyed: Collection[str]) -> str:
 
 def refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be executed now; empty if it can."""
-    if command.kind in OF_START:
+    if command.kind == "resumed" or command.kind == "latched":
         return "" if command.who == AT_START else "only the start of a run may report earlier resumes and faults"
     rule = TABLE[command.kind]
     if state not in rule.states:

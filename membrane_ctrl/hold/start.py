@@ -44,6 +44,9 @@ _UNLOCKS = "start with --standby, then `membrane-ctrl ctl unlock WORD`; or `memb
 _NICE, _ENDS_S = 10, 10.0  # of the tuning session
 
 
+_STORES_NONE = partial(LockKeeper, None)
+
+
 @dataclass(frozen=True, slots=True)
 class HoldOptions:
     """Options of the command line."""
@@ -230,7 +233,7 @@ async def _run(
     port_for: Callable[[server.RunHooks], server.Port],
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
-    keeper_for: Callable[[Callable[[events.Event], None]], LockKeeper],
+    keeper_for: Callable[[Callable[[events.Event], None]], LockKeeper] = _STORES_NONE,
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.film_law import zernike_projection
 
