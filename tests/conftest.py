@@ -6,6 +6,7 @@ import asyncio
 import inspect
 import multiprocessing
 import os
+import shutil
 import signal
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -18,8 +19,8 @@ from membrane_ctrl.instruments import lock_store
 from tests.support.undrawn import undrawn_figures
 
 # No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture starts.
-_LOCKS_FOLDER = tempfile.TemporaryDirectory(prefix="membrane-locks-")
-os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER.name
+_LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
+os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")
@@ -27,6 +28,10 @@ settings.load_profile("seeded")
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], SteadyLoop]]:
     return {"steady": SteadyLoop}
+
+
+def pytest_sessionfinish() -> None:
+    shutil.rmtree(_LOCKS_FOLDER, ignore_errors=True)
 
 
 @pytest.fixture

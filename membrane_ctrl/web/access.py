@@ -53,7 +53,7 @@ class WebUser:
 
     name: str
     role: Role
-    has_login: bool = False  # with a password; a link proves no name
+    has_login: bool = field(default=False, compare=False)  # with a password; a link proves no name
 
 
 @dataclass(frozen=True, slots=True)
