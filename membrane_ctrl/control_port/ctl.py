@@ -120,7 +120,10 @@ def lock_lines(status: Mapping[str, Any]) -> list[str]:
     list of str
     """
     lines = []
-    for each in status.get("locks") or ():
+    stated = status.get("locks")
+    for each in stated if isinstance(stated, list) else ():
+        if not isinstance(each, dict):
+            continue
         lock = Lock(**{name: str(each.get(name, "")) for name in _LOCK_FIELDS})
         problem = each.get("problem")
         lines.append(describe_lock(lock) + (f"; NOT STORED: {problem}" if problem else ""))

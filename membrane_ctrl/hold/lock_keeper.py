@@ -1,4 +1,7 @@
-"""Keeps the locks on disk in step with the controller. No tick waits for the disk; the answer to `lock` does."""
+"""Keeps the locks on disk in step with the controller. No tick waits for the disk; the answer to `lock` does.
+
+Another program may store a lock meanwhile (`safe` that does not find the hold): it becomes a command of a tick.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,18 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.controller import tick
+from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.instruments.lock_store import LockStore, StoredLock
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.errors import os_reason
-from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.lock import Lock, distinct_word
 
+_LOOK_S = 1.0  # for locks that other programs store
 _RETRY_S = 10.0  # of a write that failed
 _OUTCOMES_MOST = 256  # remembered for the port, which asks at once
 
@@ -30,7 +35,7 @@ class LockStorage:
 
 
 class LockKeeper:
-    """Stores each new lock, and removes the file of each removed one.
+    """Stores each new lock, removes the file of each removed one, and looks for locks that others store.
 
     Parameters
     ----------
@@ -38,20 +43,29 @@ class LockKeeper:
         None: locks end with the run (the twin's default).
     tell : callable
         Records that storing failed, or works again.
+    ask : callable
+        Hands a command to the next tick.
     """
 
-    def __init__(self, storage: LockStorage | None, tell: Callable[[events.Event], None]) -> None:
-        self._storage, self._tell = storage, tell
+    def __init__(
+        self,
+        storage: LockStorage | None,
+        tell: Callable[[events.Event], None],
+        ask: Callable[[Command], None] = lambda command: None,
+    ) -> None:
+        self._storage, self._tell, self._ask = storage, tell, ask
         # one thread, so that a lock and its removal stay in order
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="locks")
         self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start
         if storage is not None:
             self._files = {each.lock.word: each.file for each in storage.locks}
-        self._from_start = frozenset(self._files)
         self._failed: dict[str, Callable[[], None]] = {}  # by word: what to try again; of the disk thread
-        self._news: deque[events.Event] = deque()  # from the disk thread
+        self._news: deque[events.Event] = deque()  # from the disk thread, as the next one
+        self._asked: deque[Command] = deque()
+        self._looking: Future[None] | None = None
         self._outcomes: dict[int, Future[str]] = {}  # by number of the request
         self._retry_at_s = time.monotonic() + _RETRY_S
+        self._look_at_s = time.monotonic() + _LOOK_S
 
     @property
     def at_start(self) -> tuple[Lock, ...]:
@@ -78,7 +92,7 @@ class LockKeeper:
         self._report()
         for event in outputs.events:
             match event:
-                case events.LockSet() if event.number or event.word not in self._from_start:
+                case events.LockSet() if event.number or event.word not in self._files:
                     act = partial(self._store_lock, self._storage, _lock_of(event))
                     self._start(event.number, event.word, act)
                 case events.LockRemoved():
@@ -87,6 +101,9 @@ class LockKeeper:
         if time.monotonic() >= self._retry_at_s:
             self._retry_at_s = time.monotonic() + _RETRY_S
             self._disk.submit(self._retry)
+        if time.monotonic() >= self._look_at_s and (self._looking is None or self._looking.done()):
+            self._look_at_s = time.monotonic() + _LOOK_S
+            self._looking = self._disk.submit(self._find_new, self._storage)
 
     def outcome(self, number: int) -> Future[str] | None:
         """Return the outcome of a request that set or removed a lock.
@@ -133,6 +150,19 @@ class LockKeeper:
             self._news.append(run_events.LockStored(word))
         return ""
 
+    def _find_new(self, storage: LockStorage) -> None:
+        """Ask for each lock on our devices that another program has stored.
+
+        What cannot be read is no lock here, as it is at the start: a disk that fails must not end a hold of weeks.
+        """
+        known = set(self._files.values())
+        for each in storage.store.find_locks(storage.devices):
+            if not each.devices or each.file in known:
+                continue
+            lock = replace(each.lock, word=distinct_word(each.lock.word, self._files))
+            self._files[lock.word] = each.file
+            self._asked.append(Command("latch", AT_START, text=lock.text, lock=lock))
+
     def _retry(self) -> None:
         for word, act in list(self._failed.items()):
             self._try(word, act)
@@ -140,6 +170,8 @@ class LockKeeper:
     def _report(self) -> None:
         while self._news:
             self._tell(self._news.popleft())
+        while self._asked:
+            self._ask(self._asked.popleft())
 
 
 def _lock_of(event: events.LockSet) -> Lock:

@@ -233,7 +233,9 @@ async def _run(
     port_for: Callable[[server.RunHooks], server.Port],
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
-    keeper_for: Callable[[Callable[[events.Event], None]], LockKeeper] = _STORES_NONE,
+    keeper_for: Callable[[Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper] = (
+        _STORES_NONE
+    ),
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.film_law import zernike_projection
 
@@ -243,7 +245,7 @@ async def _run(
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
-        keeper = keeper_for(lambda event: _tell_all(event, supervisor, wiring))
+        keeper = keeper_for(lambda event: _tell_all(event, supervisor, wiring), supervisor.ask)
         hooks = server.RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome)
         port = port_for(hooks)
         latch, systemd = latch_for(supervisor.tell), SystemdNotify()

@@ -116,7 +116,7 @@ class LockStore:
         OSError
             If no folder can be written; it names the first.
         """
-        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")
         name = f"{stamp}-{lock.word}-{secrets.token_hex(4)}{_SUFFIX}"
         table = {"schema": SCHEMA, "devices": sorted(devices), **asdict(lock)}
         data = (json.dumps(table, indent=1) + "\n").encode()

@@ -52,7 +52,7 @@ class Client:
 def test_a_session_does_not_begin_on_a_locked_mirror() -> None:
     _require_unlocked(Client({"state": "hold", "locks": []}))  # type: ignore[arg-type]
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann"}
-    with pytest.raises(DeviceError, match="locked: .*hands inside.*unlock"):
+    with pytest.raises(DeviceError, match=r"locked: .*hands inside.*unlock"):
         _require_unlocked(Client({"state": "standby", "locks": [lock]}))  # type: ignore[arg-type]
 
 

@@ -178,6 +178,17 @@ def test_a_lock_that_cannot_be_stored_holds_for_the_run_and_says_so(
     assert "several" in capsys.readouterr().err
 
 
+def test_safe_stops_a_hold_that_it_does_not_find(lab: Lab) -> None:
+    """The hold's folder of runs is not the configured one: `safe` stores a lock, and the hold sees it."""
+    lab.hold()
+    wait_for(lambda: lab.pump() > 0)
+    assert run(["safe", str(lab.folder / "lab.toml"), "--logs", str(lab.folder / "elsewhere")]) == 0
+    wait_for(lambda: bool(lab.events("lock")))
+    (lock,) = lab.events("lock")
+    assert lock["text"] == "made safe by hand"
+    wait_for(lambda: lab.pump() == 0)
+
+
 def test_locks_are_listed_and_removed_without_a_hold(
     lab: Lab, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

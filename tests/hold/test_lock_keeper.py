@@ -12,6 +12,7 @@ from typing import Any, cast
 import pytest
 
 from membrane_ctrl.config.schema import Config, DevicesConfig, StatesConfig
+from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold import lock_keeper
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
@@ -38,10 +39,10 @@ def outputs(*events: Event) -> TickOutputs:
 
 
 @contextmanager
-def keeper(folder: Path, told: list[Event]) -> Iterator[LockKeeper]:
+def keeper(folder: Path, told: list[Event], asked: list[Command] | None = None) -> Iterator[LockKeeper]:
     store = LockStore([folder])
     storage = LockStorage(store, DEVICES, tuple(store.find_locks(DEVICES)))
-    with LockKeeper(storage, told.append) as made:
+    with LockKeeper(storage, told.append, [].append if asked is None else asked.append) as made:
         yield made
 
 
@@ -130,6 +131,35 @@ def test_a_removal_that_fails_is_tried_again_at_the_end(tmp_path: Path, monkeypa
             assert outcome(kept, 4) != ""
         assert words(tmp_path) == ["bofak"]
     assert words(tmp_path) == []
+
+
+def test_a_lock_that_another_program_stores_becomes_a_command_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock_keeper, "_LOOK_S", 0.0)
+    asked: list[Command] = []
+    other = LockStore([tmp_path])
+    other.write_lock(Lock("tarep", "of an earlier run", "unix:ann"), DEVICES)
+    with keeper(tmp_path, [], asked) as kept:
+        kept.heard(outputs(SET))
+        assert outcome(kept, 3) == ""
+        other.write_lock(Lock("gumil", "on another bench", "unix:bob"), {"10.0.0.6 port 502 unit 1"})
+        (tmp_path / "damaged.json").write_text("{")
+        other.write_lock(Lock("bofak", "made safe by hand", "unix:bob"), DEVICES)
+        until(lambda: kept.heard(outputs()), lambda: bool(asked))
+        for _ in range(20):
+            kept.heard(outputs())
+            time.sleep(0.005)
+        (command,) = asked
+        assert (command.kind, command.text) == ("latch", "made safe by hand")
+        lock = command.lock
+        assert lock is not None
+        assert lock.word not in ("bofak", "tarep")
+        kept.heard(outputs(LockSet(lock.word, lock.text, lock.author, "", "", "", 0)))
+        kept.heard(outputs(LockRemoved(lock.word, "", "", "", "page:bob", "word", 9)))
+        assert outcome(kept, 9) == ""
+    texts = [each.lock.text for each in other.find_locks(DEVICES) if each.devices]
+    assert texts == ["of an earlier run", "hands inside"]
 
 
 def test_the_twin_stores_nothing() -> None:
