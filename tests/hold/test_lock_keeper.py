@@ -7,16 +7,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
 from membrane_ctrl.config.schema import Config, DevicesConfig, StatesConfig
-from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold import lock_keeper
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
-from membrane_ctrl.hold.start import HoldOptions, _find_locks
+from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _ask_first, _find_locks
 from membrane_ctrl.instruments.lock_store import LockStore, device_keys
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import Event, LockRemoved, LockSet
@@ -193,6 +194,23 @@ def test_in_standby_it_starts_with_the_locks() -> None:
     storage = _find_locks(BOARD, options(BOARD, standby=True))
     assert storage is not None
     assert [each.lock.word for each in storage.locks] == ["bofak"]
+
+
+class Latch:
+    """The latched fault of an earlier run."""
+
+    latched, resumes_s = "over_pressure", ()
+
+
+def test_a_run_in_standby_begins_with_its_locks_and_its_latched_fault_as_commands() -> None:
+    asked: list[Command] = []
+    supervisor, latch = cast(Any, SimpleNamespace(ask=asked.append)), cast(Any, Latch())
+    lock = Lock("bofak", "hands inside", "unix:ann", "unix:ann")
+    _ask_first(supervisor, True, latch, BoardAtStart(latched="the board has latched"), (lock,))
+    first, second = asked
+    assert (first.kind, first.who, first.lock) == ("latch", AT_START, lock)
+    assert (second.kind, second.who) == ("latched", AT_START)
+    assert second.text == "over_pressure; the board has latched"
 
 
 def test_the_twin_has_locks_of_earlier_runs_only_if_configured() -> None:
