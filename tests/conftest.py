@@ -5,14 +5,22 @@ from __future__ import annotations
 import asyncio
 import inspect
 import multiprocessing
+import os
+import shutil
 import signal
+import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 
 import pytest
 from hypothesis import settings
 from steady_loop import SteadyLoop
 
+from membrane_ctrl.instruments import lock_store
 from tests.support.undrawn import undrawn_figures
+
+# No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture starts.
+_LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
+os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")
@@ -20,6 +28,10 @@ settings.load_profile("seeded")
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], SteadyLoop]]:
     return {"steady": SteadyLoop}
+
+
+def pytest_sessionfinish() -> None:
+    shutil.rmtree(_LOCKS_FOLDER, ignore_errors=True)
 
 
 @pytest.fixture
@@ -46,6 +58,12 @@ def undrawn() -> Iterator[None]:
     """For a test that needs no picture; pictures of its module's fixtures are drawn before."""
     with undrawn_figures():
         yield
+
+
+@pytest.fixture(autouse=True)
+def own_locks(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The locks of a test are its own."""
+    monkeypatch.setenv(lock_store.VARIABLE, str(tmp_path_factory.mktemp("locks")))
 
 
 @pytest.fixture(autouse=True)

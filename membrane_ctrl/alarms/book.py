@@ -45,6 +45,12 @@ def signs_of(event: events.Event) -> list[Sign]:
             return [Sign("glitch", False)]
         case events.StateEntered(from_="fault"):
             return [Sign("fault", False), Sign("glitch", False)]
+        case events.LockSet():
+            session = f" ({event.session})" if event.session else ""
+            text = f'"{event.text}" by {event.author}{session}, {event.set_utc}, word {event.word}'
+            return [Sign("lock", True, "warning", text, about=event.word)]
+        case events.LockRemoved():
+            return [Sign("lock", False, about=event.word), Sign("lock_storage", False, about=event.word)]
         case events.Maintenance():
             return [Sign(f"maintenance_{event.name}", True, "warning", event.message)]
         case events.MaintenanceOver():
@@ -86,6 +92,11 @@ def _signs_of_process(event: events.Event) -> list[Sign]:
             return [Sign("latch", True, "critical", text)]
         case run_events.LatchWritten():
             return [Sign("latch", False)]
+        case run_events.LockNotStored():
+            text = f"the lock {event.word} is not as stored: {event.message}"
+            return [Sign("lock_storage", True, "critical", text, about=event.word)]
+        case run_events.LockStored():
+            return [Sign("lock_storage", False, about=event.word)]
         case run_events.Ended() if event.exit not in ("done", "interrupted"):
             return [Sign("run_ended", True, "critical", f"the run has ended: {event.exit}")]
     return []

@@ -33,6 +33,9 @@ FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s 
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
+WordArgument = Annotated[
+    str, typer.Argument(metavar="WORD", help="The lock's word, as displayed; without it, your own lock.")
+]
 GainsArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or just the keys: 'kp_per_s = 0.5'.")
 ]
@@ -131,6 +134,10 @@ def _latch(text: ReasonArgument = "") -> dict[str, Any]:
     return {"text": text}
 
 
+def _unlock(word: WordArgument = "") -> dict[str, Any]:
+    return {"text": word}
+
+
 def _shape(on: OnArgument) -> dict[str, Any]:
     return {"do": "shape_on" if on else "shape_off"}
 
@@ -145,6 +152,7 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
     "gains": _gains,
     "mark": _mark,
     "latch": _latch,
+    "unlock": _unlock,
 }
 
 
@@ -160,7 +168,7 @@ def _fleet(
 
 def add_actions() -> None:
     """Add the commands of `ctl`. Other commands need not wait for the controller's table."""
-    from membrane_ctrl.controller.commands import TABLE
+    from membrane_ctrl.controller.commands import SAME_AS, TABLE
 
     if ctl_app.registered_commands:
         return
@@ -170,6 +178,8 @@ def add_actions() -> None:
     for kind, rule in TABLE.items():
         if kind in _OWN or not (rule.needs or kind.startswith("shape_")):  # `tune` is a separate command
             _add(kind, rule.does, _OWN.get(kind, _plain))
+    for name, kind in SAME_AS.items():
+        _add(name, TABLE[kind].does, _OWN.get(kind, _plain))
     _add("shape", "Switch the shape loop on or off.", _shape)
     _add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
     _add("release", "Release command, so that someone else may take it.", _plain)

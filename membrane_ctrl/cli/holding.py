@@ -17,6 +17,7 @@ from json import dumps
 
 twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 devices_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
+locks_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
 
 FlatOption = Annotated[
@@ -25,13 +26,14 @@ FlatOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `config`."""
+    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`, `config`."""
     for command in (hold, safe, check, conformance):
         app.command()(command)
     app.add_typer(devices_app, name="devices")
     app.add_typer(twin_app, name="twin")
     app.add_typer(ctl_app, name="ctl")
     app.add_typer(alarm_app, name="alarm")
+    app.add_typer(locks_app, name="locks")
     app.add_typer(config_app, name="config")
 
 
@@ -120,7 +122,7 @@ def safe(
     config: ConfigArgument,
     logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
     latch: Annotated[
-        bool, typer.Option(help="Lock the pump until a person clears the latch; --no-latch spares a running program.")
+        bool, typer.Option(help="Lock the devices until a person unlocks them; --no-latch spares a running program.")
     ] = True,
 ) -> int:
     """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""
@@ -172,6 +174,28 @@ def conformance(
     from membrane_ctrl.commissioning.check import run_conformance
 
     return run_conformance(url, unit_id, json)
+
+
+@locks_app.callback()
+def locks(context: typer.Context, json: JsonOption = False) -> int:
+    """List the locks on this machine's devices; with `remove`, remove one while no hold runs."""
+    if context.invoked_subcommand is not None:
+        return errors.Exit.DONE
+    from membrane_ctrl.commissioning.locks import list_locks
+
+    return list_locks(json)
+
+
+@locks_app.command()
+def remove(
+    word: Annotated[
+        str, typer.Argument(metavar="WORD", help="The lock's word, as displayed; without it, your own lock.")
+    ] = "",
+) -> int:
+    """Remove your lock, or another person's by typing its word. While a hold runs, use `ctl unlock`."""
+    from membrane_ctrl.commissioning.locks import remove_lock
+
+    return remove_lock(word)
 
 
 @alarm_app.command("test")

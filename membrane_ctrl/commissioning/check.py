@@ -24,7 +24,7 @@ from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import bench, lock_store
 from membrane_ctrl.model import errors, plain_json, telemetry, terminal
 from membrane_ctrl.model.clock import RunClock
 
@@ -139,6 +139,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _geometry(config),
         "shape loop": figures if shape.enabled else "off",
+        "locks": _locks(config),
         "control port": _port(config.port),
         "alarms": _alarms(config.alarms),
     }
@@ -157,6 +158,14 @@ def _port(port: PortConfig) -> str:
     if port.metrics_port is not None:
         ways.append(f"metrics on 127.0.0.1:{port.metrics_port}")
     return ", ".join(ways)
+
+
+def _locks(config: Config) -> str:
+    """The locks that keep a hold down."""
+    if config.devices is None:
+        return "none"
+    found = lock_store.LockStore.of_machine().find_locks(lock_store.device_keys(config.devices))
+    return lock_store.locked_line([each.lock for each in found]) if found else "none"
 
 
 def _alarms(alarms: AlarmsConfig) -> str:
@@ -303,10 +312,11 @@ def _grab(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     """`conformance`: test a board and report; exits with REJECTED if it fails.
 
-    Raises InputError for a bad URL, DeviceError if the board does not answer or another program uses it.
+    Raises InputError for a bad URL, DeviceError if the board is locked, does not answer, or another program uses it.
     """
     try:
         with bench.locked(bench.modbus_names(url, unit_id)):
+            lock_store.require_unlocked(lock_store.LockStore.of_machine(), lock_store.modbus_keys(url, unit_id))
             findings = asyncio.run(conformance.examine(url, unit_id))
     except ValueError as error:
         raise errors.InputError(str(error)) from None

@@ -1,4 +1,4 @@
-"""`safe`: stops the pump, whichever program runs it, and keeps it stopped until a person clears the latch.
+"""`safe`: stops the pump, whichever program runs it, and locks its devices until a person removes the lock.
 
 For operators in doubt, and for `ExecStopPost`. It works even if the control process is dead or hangs. It claims no
 device, arms no watchdog and opens no sensor.
@@ -15,12 +15,11 @@ from pathlib import Path
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import bench, lock_store
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
-from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile
+from membrane_ctrl.model.lock import Lock
 
-_CAUSE = "made safe by hand"
-_REMEDY = "ask the person who made it safe whether the mirror may move"
+_TEXT = "made safe by hand"
 _LOOK_S = 0.1
 _LAPSE_S = 1.0  # beyond a watchdog period the board will not stop the pump any more
 
@@ -28,10 +27,10 @@ _LAPSE_S = 1.0  # beyond a watchdog period the board will not stop the pump any 
 def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
     """Stop the pump of a configuration from `source`; leave the vent as it is.
 
-    With `latch`, nothing runs the pump until a person clears the latch: at the board, in a running hold and in the
-    next one. Without it, a program that has the devices keeps running.
+    With `latch`, the board latches its stop and the devices are locked: nothing runs the pump until a person removes
+    the lock. Without it, a program that has the devices keeps running.
 
-    Raises InputError without devices, DeviceError if the pump could not be stopped or latched.
+    Raises InputError without devices, DeviceError if the pump could not be stopped or locked.
     """
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; nothing to make safe")
@@ -41,15 +40,16 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)
     stopped = _tried(config.devices)
-    told = _hold_told(config, folder)
-    if not stopped.lasts:  # the hold may have commanded the pump again before it was latched
+    by_hold = _lock_hold(config, folder)
+    if not stopped.lasts:  # the hold may have commanded the pump again before it was locked
         stopped = _tried(config.devices)
-    if stopped.problem and not told:
+    if stopped.problem and not by_hold.locked:
         raise DeviceError(f"{stopped.problem}; cut the pump's power if it runs")
-    for line in (stopped.words, told):
+    for line in (stopped.words, by_hold.words):
         if line:
             print(line, file=sys.stderr)
-    _keep(LatchedFile(folder))
+    if not by_hold.stored:
+        _store_lock(config.devices)
     return Exit.DONE
 
 
@@ -134,33 +134,49 @@ async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
     return await board.read()
 
 
-def _hold_told(config: Config, folder: Path) -> str:
-    """Latch a running hold; returns the result, empty if none answers."""
+@dataclass(frozen=True, slots=True)
+class _LockedByHold:
+    """What a running hold has done; `stored` means that its lock is on the disk."""
+
+    words: str = ""
+    locked: bool = False
+    stored: bool = False
+
+
+def _lock_hold(config: Config, folder: Path) -> _LockedByHold:
+    """Lock a running hold, if one answers."""
     path = config.port.socket_in(folder)
     if not config.port.enabled or not path.exists():
-        return ""
+        return _LockedByHold()
     from membrane_ctrl.control_port import client  # only now: the pump is stopped sooner without
 
     try:
         with client.PortClient.unix(path, notice=lambda _: None) as hold:
-            answer = hold.ask(do="latch", text=_CAUSE, why="membrane-ctrl safe")
+            answer = hold.ask(do="latch", text=_TEXT, why="membrane-ctrl safe")
             run = str(hold.greeting.get("run", ""))
     except DeviceError as error:
-        print(f"the running hold could not be latched: {error}", file=sys.stderr)
-        return ""
+        print(f"the running hold could not be locked: {error}", file=sys.stderr)
+        return _LockedByHold()
     if not answer.get("ok"):
-        print(f"the running hold refused to latch: {answer.get('refused', '')}", file=sys.stderr)
-        return ""
-    return f"run {run}: latched, until `membrane-ctrl ctl ack`"
+        print(f"the running hold refused the lock: {answer.get('refused', '')}", file=sys.stderr)
+        return _LockedByHold()
+    lock = answer.get("lock")
+    word = str(lock.get("word", "")) if isinstance(lock, dict) else ""
+    words = f"run {run}: locked, until `membrane-ctrl ctl unlock {word}`"
+    return _LockedByHold(words, locked=True, stored=answer.get("stored") is True)
 
 
-def _keep(file: LatchedFile) -> None:
-    """Write the latch, which blocks holds until a person clears it. Raises DeviceError."""
-    now = datetime.now(UTC).isoformat(timespec="seconds")
+def _store_lock(devices: DevicesConfig) -> None:
+    """Store a lock on the devices, which keeps every command down until a person removes it. Raises DeviceError."""
+    store, keys = lock_store.LockStore.of_machine(), lock_store.device_keys(devices)
+    account = f"unix:{getpass.getuser()}"
+    word = lock_store.draw_word({each.lock.word for each in store.find_locks()})
+    set_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    lock = Lock(word, _TEXT, account, account, "membrane-ctrl safe", set_utc)
     try:
-        file.path.parent.mkdir(parents=True, exist_ok=True)
-        file.add(LatchedFault("locked", _CAUSE, f"by {getpass.getuser()}", _REMEDY, now, "none"))
+        file = store.write_lock(lock, keys)
     except OSError as error:
-        reason = os_reason(error)
-        raise DeviceError(f"{file.path}: the pump is stopped, but not latched ({reason})") from None
-    print(f"{file.path}: no hold before `membrane-ctrl hold --clear-faults` or `ctl ack`", file=sys.stderr)
+        raise DeviceError(
+            f"{error.filename or 'the locks'}: the pump is stopped, but not locked ({os_reason(error)})"
+        ) from None
+    print(f"{file}: nothing moves the mirror before `membrane-ctrl locks remove {word}`", file=sys.stderr)

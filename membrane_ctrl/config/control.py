@@ -201,7 +201,7 @@ class StatesConfig(Section):
     vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0
     """Gauge pressure below which `vent` is done. Change it for a gauge whose zero is uncertain."""
     latch_twin_faults: bool = False
-    """Let a trip of the twin block the next run, as a real one does. Set it to true to practise recovery."""
+    """Let a trip or a lock of the twin block the next run, as a real one does. Set it to practise recovery."""
     stay_after_trip: bool = False
     """Wait in `fault` for `ctl ack` instead of ending the run. Set it to true to acknowledge remotely."""
 

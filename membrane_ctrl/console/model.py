@@ -9,6 +9,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, go_on, is_paused, number, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
+from membrane_ctrl.model.lock import describe_lock
 
 MINUTE_S = 60
 TREND_S = 240  # the widest terminal shows this much
@@ -71,6 +72,7 @@ class ConsoleView:
 
     row: telemetry.TelemetryRow | None  # the newest tick; None before the first
     why: str  # the answer in one line
+    locks: tuple[str, ...]  # each lock in words
     go_on: str  # how to go on, if that takes a person
     paused: bool
     silent_s: float  # age of the row if it deserves a warning, else 0
@@ -158,7 +160,8 @@ class ConsoleModel:
         return ConsoleView(
             row=row,
             why=self._why(),
-            go_on=go_on(row, status.why, self._ctl, self._keys) if row else "",
+            locks=tuple(map(describe_lock, status.locks)),
+            go_on=go_on(row, status.why, self._ctl, self._keys, status.locks, status.latched) if row else "",
             paused=row is not None and is_paused(row, status.why),
             silent_s=age_s if age_s > SILENT_S else 0.0,
             state=telemetry.State(int(row.state)) if row else telemetry.State.STANDBY,

@@ -25,7 +25,8 @@ from membrane_ctrl.processes import child, ring
 
 # For a log file: one line per second, and these at once
 _AT_ONCE = (
-    events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
+    events.LockSet | events.LockRemoved | run_events.LockNotStored
+    | events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
     | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
     # a full disk cannot store the event either
     | run_events.RecorderError | run_events.DiskLow | run_events.RecorderRecovered
@@ -49,6 +50,7 @@ def line(view: model.ConsoleView) -> str:
         f"late {why.number(row.lateness_ms, 1)} ms",
         view.why,
     ]
+    parts += [f"LOCKED {lock}" for lock in view.locks]
     if view.go_on:
         parts.append(view.go_on)
     if view.recording:

@@ -15,6 +15,7 @@ from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
 from membrane_ctrl.console.why import NONE, duration, holders, number, percent
 from membrane_ctrl.model import telemetry
 
+_LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
 
 
@@ -166,7 +167,12 @@ def _headline(view: ConsoleView, config: Config) -> Text:
         return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
     outside = view.row is not None and abs(view.row.error_um) > config.limits.band_um
     style = "bold red" if view.fault else "bold yellow" if outside else "bold"
-    line = Text(view.why, style=style, overflow="fold")
+    line = Text(overflow="fold")
+    for lock in view.locks[:_LOCKS_SHOWN]:
+        line.append(f"LOCKED {lock}\n", style="bold white on red")
+    if len(view.locks) > _LOCKS_SHOWN:
+        line.append(f"LOCKED by {len(view.locks) - _LOCKS_SHOWN} more locks\n", style="bold white on red")
+    line.append(view.why, style=style)
     return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
 
 

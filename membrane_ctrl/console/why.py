@@ -1,8 +1,10 @@
 """One line that answers "why is the pump where it is" and "why is it not holding"."""
 
 import math
+from collections.abc import Sequence
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 
 _LEVELS = {
@@ -56,10 +58,12 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
 
 
-def go_on(row: TelemetryRow, told: str, ctl: str, keys: bool) -> str:
+def go_on(row: TelemetryRow, told: str, ctl: str, keys: bool, locks: Sequence[Lock] = (), latched: str = "") -> str:
     """How to go on from a state that waits for a person, empty in others; `ctl` begins a command for this run."""
     state = State(int(row.state))
-    if state == State.STANDBY and told.startswith("standby: locked"):
+    if locks:
+        return f"go on: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
+    if state == State.STANDBY and latched:
         state = State.FAULT
     command, key = ("resume", " or key p") if is_paused(row, told) else _GO_ON.get(state, ("", ""))
     return f"go on: `{ctl} {command}`{key if keys else ''}" if command else ""

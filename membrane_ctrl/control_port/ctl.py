@@ -3,9 +3,9 @@
 import json
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
+from membrane_ctrl.model.lock import Lock, describe_lock
+
+_LOCK_FIELDS = tuple(field.name for field in fields(Lock))
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,11 @@ def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
             print("\n".join(status_lines(answer["status"])))
         else:
             state = f"; the state was {answer['state']}" if "state" in answer else ""
-            print(f"{action}: done{state}", file=sys.stderr)
+            lock = f": word {answer['lock']['word']}" if "lock" in answer else ""
+            print(f"{action}: done{lock}{state}", file=sys.stderr)
+    if answer.get("problem"):
+        print(f"{action}: NOT STORED, only this run knows: {answer['problem']}", file=sys.stderr)
+        return errors.Exit.DEVICE_FAILED
     return errors.Exit.DONE
 
 
@@ -94,15 +101,40 @@ def fleet_line(status: dict[str, Any]) -> str:
         return f"{'no contact':10}{'':14}{status['problem']}"
     row, fault = status.get("row") or {}, status.get("fault")
     notices = [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
-    words = [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
+    words = [f"LOCKED {line}" for line in lock_lines(status)]
+    words += [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
     words += notices or [str(status.get("why") or "as it should be")]
     return f"{status['state']:10}{_shown(row.get('error_um'))} um {'; '.join(words)}"
+
+
+def lock_lines(status: Mapping[str, Any]) -> list[str]:
+    """Return a line for each lock of a status: text, author, time, word, and whether it is not stored.
+
+    Parameters
+    ----------
+    status : mapping
+        As the port answers it.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = []
+    stated = status.get("locks")
+    for each in stated if isinstance(stated, list) else ():
+        if not isinstance(each, dict):
+            continue
+        lock = Lock(**{name: str(each.get(name, "")) for name in _LOCK_FIELDS})
+        problem = each.get("problem")
+        lines.append(describe_lock(lock) + (f"; NOT STORED: {problem}" if problem else ""))
+    return lines
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
     """Format the status for people."""
     row, fault = status.get("row") or {}, status.get("fault")
     lines = [f"{status.get('run', '?')}: {status['state']} - {status['why'] or 'as it should be'}"]
+    lines += [f"LOCKED {line}" for line in lock_lines(status)]
     if fault:
         lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
     if row:

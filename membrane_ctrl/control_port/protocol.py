@@ -16,11 +16,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.controller.commands import TABLE, Kind, Role
+from membrane_ctrl.controller.commands import SAME_AS, TABLE, Kind, Role
 from membrane_ctrl.model.events import Event
 
 VERSION = 1
@@ -54,6 +54,22 @@ def _words(most_bytes: int) -> AfterValidator:
     return AfterValidator(check)
 
 
+class OnBehalf(Section):
+    """For whom a program sends a request: the page for its viewers, a bridge for other systems.
+
+    The hold accepts the account only from a process of its own user on the socket file. From anybody the role only
+    lowers the sender's own.
+    """
+
+    via: Literal["page", "bridge"]
+    account: Annotated[str, _words(WHO_BYTES - 8)] = (
+        ""  # name with which the person logged in; empty: without a login
+    )
+    name: Annotated[str, _words(WHO_BYTES - 8)] = ""  # who it is, for people, if there is no login
+    session: Annotated[str, _words(WHO_BYTES)] = ""  # of that person
+    role: Role
+
+
 class Request(Section):
     """A client's request."""
 
@@ -63,7 +79,8 @@ class Request(Section):
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
-    text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
+    # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a person typed
+    text: Annotated[str, _words(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
     experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
@@ -71,6 +88,12 @@ class Request(Section):
     setpoint_step_um: Annotated[float, Field(ge=-30, le=30)] | None = None  # `gains`: of the setpoint, on trial
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
+    on_behalf: OnBehalf | None = None  # None: the peer of the connection itself
+
+    @field_validator("do", mode="before")
+    @classmethod
+    def _one_name(cls, do: object) -> object:
+        return SAME_AS.get(do, do) if isinstance(do, str) else do
 
     @model_validator(mode="after")
     def _complete(self) -> Request:
@@ -199,7 +222,7 @@ _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
 
 # These need no command: stopping the pump is always accepted, and the others move nothing
-FREE = frozenset({"status", "watch", "stop", "latch", "mark", "release", "quiet"})
+FREE = frozenset({"status", "watch", "stop", "latch", "unlock", "mark", "release", "quiet"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,14 +231,52 @@ class Peer:
 
     who: str
     role: Role
+    session: str = ""  # what identifies the connection
+    is_own_user: bool = False  # a process of the hold's own user on the socket file
 
 
-def may_not(peer: Peer, do: Action) -> str:
-    """Why the peer's role forbids this request; empty if it does not."""
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """Who sends a request: the peer itself, or somebody for whom it sends it."""
+
+    who: str  # for people and for the record
+    role: Role
+    account: str = ""  # login, by which an author is known; empty: none, or not proven
+    session: str = ""
+    from_person: bool = True  # False: a bridge's
+
+
+def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
+    """Return who sends a request, with the lower of the two roles.
+
+    Parameters
+    ----------
+    peer : Peer
+        Of the connection, as the system or a certificate identifies it.
+    on_behalf : OnBehalf or None
+        What the request itself states.
+
+    Returns
+    -------
+    Sender
+    """
+    if on_behalf is None:
+        return Sender(peer.who, peer.role, account=peer.who, session=peer.session)
+    role = min(peer.role, on_behalf.role, key=_RANK.__getitem__)
+    from_person = on_behalf.via == "page"
+    if not peer.is_own_user:  # anybody could state this: it proves no login, and the peer sends it for somebody else
+        return Sender(peer.who, role, session=peer.session, from_person=from_person)
+    who = f"{on_behalf.via}:{on_behalf.account or on_behalf.name}"
+    account = who if from_person and on_behalf.account else ""
+    return Sender(who, role, account, on_behalf.session, from_person)
+
+
+def may_not(sender: Peer | Sender, do: Action) -> str:
+    """Why the sender's role forbids this request; empty if it does not."""
     needed = TABLE[do].role if do in TABLE else _ERRANDS[do]
-    if _RANK[peer.role] >= _RANK[needed]:
+    if _RANK[sender.role] >= _RANK[needed]:
         return ""
-    return f"{do} needs the role {needed}; {peer.who} has {peer.role}"
+    return f"{do} needs the role {needed}; {sender.who} has {sender.role}"
 
 
 class Commander:

@@ -10,20 +10,25 @@ import itertools
 import math
 import socket
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
-from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, PortSession, may_not
+from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, PortSession, Sender, may_not
 from membrane_ctrl.controller import commands, cross_check_plant, tick
+from membrane_ctrl.instruments.lock_store import draw_word
 from membrane_ctrl.model import errors, events, run_events, telemetry
+from membrane_ctrl.model.lock import Lock
 
 # Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out another's `stop`
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 _ANSWER_S = 5.0
+_STORE_S = 0.7  # for the disk to confirm a lock: a safety command is answered within a second
 _EXPIRED = "the certificate has expired"
 _OVER = "the run is over"
 
@@ -37,6 +42,8 @@ class RunHooks:
     now: Callable[[], float]  # the run's clock
     loop: Callable[[], schema.LoopConfig]  # present loop settings
     pump: Callable[[], schema.PumpConfig]  # likewise
+    # of a request that set or removed a lock: why it is not on the disk, empty if it is; None: it changed no lock
+    lock_outcome: Callable[[int], Future[str] | None] = lambda number: None
 
 
 class Port:
@@ -50,6 +57,7 @@ class Port:
         self._status = telemetry.RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
+        self._changed: dict[int, dict[str, str]] = {}  # by number of the request: the lock that it set or removed
         self._sessions: list[PortSession] = []
         self._over = False
 
@@ -58,6 +66,8 @@ class Port:
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
             self._status = self._status.after_event(event, outputs.row.mono_s)
+            if isinstance(event, events.LockSet | events.LockRemoved) and event.number in self._waiting:
+                self._changed[event.number] = {"word": event.word, "text": event.text, "author": event.author}
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
@@ -168,20 +178,38 @@ class Port:
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
-        refusal = may_not(peer, request.do) or self._claim_command(peer, request)
+        sender = protocol.sender_of(peer, request.on_behalf)
+        refusal = may_not(sender, request.do) or self._claim_command(peer, request)
         if not refusal and request.do not in commands.TABLE:
-            return self._run_errand(session, request)
+            return self._run_errand(session, sender, request)
         try:
-            command = self._command(peer, request) if not refusal else None
+            command = self._command(sender, request) if not refusal else None
         except errors.InputError as error:
             refusal, command = str(error), None
         if command is None:
-            self._refusals.record(peer.who, request.do, refusal, request.why)
+            self._refusals.record(sender.who, request.do, refusal, request.why)
             return {"ok": False, "refused": refusal}
         refusal = await self._obeyed(command)
         if refusal:
             return {"ok": False, "refused": refusal}
-        return {"ok": True, "state": status_table(self._status)["state"]}
+        answer = {"ok": True, "state": status_table(self._status)["state"]}
+        if request.do in ("latch", "unlock"):
+            answer |= await self._lock_answer(command)
+        return answer
+
+    async def _lock_answer(self, command: commands.Command) -> dict[str, Any]:
+        """The part of the answer that confirms a lock or its removal: only what is synced to the disk is stored."""
+        changed = self._changed.pop(command.number, None)
+        found = {} if changed is None else {"lock": changed}
+        future = self._hooks.lock_outcome(command.number)
+        if future is None:
+            return found
+        try:
+            async with asyncio.timeout(_STORE_S):
+                problem = await asyncio.wrap_future(future)
+        except TimeoutError:
+            problem = f"the disk has not confirmed it within {_STORE_S:g} s"
+        return found | {"stored": not problem, "problem": problem}
 
     def _claim_command(self, peer: Peer, request: protocol.Request) -> str:
         if request.do in FREE:
@@ -195,7 +223,7 @@ class Port:
                     session.notice(f"{peer.who} has taken over command" + (f": {request.why}" * bool(request.why)))
         return refusal
 
-    def _run_errand(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
+    def _run_errand(self, session: PortSession, sender: Sender, request: protocol.Request) -> dict[str, Any]:
         who = session.peer.who
         match request.do:
             case "watch":
@@ -204,7 +232,7 @@ class Port:
                 self._commander.release(who)
                 self._tell(run_events.CommanderChanged(None, who, request.why))
             case "quiet":
-                self._tell(run_events.AlarmsAcknowledged(who, request.why))
+                self._tell(run_events.AlarmsAcknowledged(sender.who, request.why))
         return {
             "ok": True,
             "status": self.status(),
@@ -212,7 +240,7 @@ class Port:
             "pump": self._hooks.pump().model_dump(),
         }
 
-    def _command(self, peer: Peer, request: protocol.Request) -> commands.Command:
+    def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for invalid gains or an invalid experiment."""
         kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
@@ -226,7 +254,7 @@ class Port:
         )
         return commands.Command(
             kind,
-            peer.who,
+            sender.who,
             request.why,
             value,
             request.text,
@@ -236,7 +264,16 @@ class Port:
             shape_s,
             pump,
             step_um,
+            lock=self._new_lock(sender, request) if kind == "latch" else None,
+            account=sender.account if kind == "unlock" else "",
+            from_person=sender.from_person,
         )
+
+    def _new_lock(self, sender: Sender, request: protocol.Request) -> Lock:
+        """The lock that a request sets. Word and time are drawn here, so that the tick gets them as inputs."""
+        word = draw_word({lock.word for lock in self._status.locks})
+        set_utc = datetime.now(UTC).isoformat(timespec="seconds")
+        return Lock(word, request.text, sender.who, sender.account, sender.session, set_utc)
 
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:
         if "setpoint_um" in changes:
@@ -280,6 +317,7 @@ def metrics_text(status: telemetry.RunStatus, clients: int, refused: int) -> str
 
     add("port_clients", "gauge", ("", clients))
     add("port_refused_total", "counter", ("", refused))
+    add("locks", "gauge", ("", len(status.locks)))
     add("recording_ok", "gauge", ("", not status.recording))
     row = status.row
     if row is not None:
@@ -323,6 +361,8 @@ def status_table(status: telemetry.RunStatus) -> dict[str, Any]:
         "state": telemetry.State(int(row.state)).name.lower(),
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
+        "locks": [{**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks],
+        "latched": status.latched,
         "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
         "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
         "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),

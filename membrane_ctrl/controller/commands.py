@@ -9,11 +9,12 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.model.events import CommandTaken
+from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.telemetry import State
 
 Kind = Literal[
     "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
-    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch", "capture",
+    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch", "unlock", "capture",
 ]  # fmt: skip
 Role = Literal["read", "operate", "tune"]
 
@@ -22,10 +23,14 @@ AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
 MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 
+# People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the bridges and in the
+# recorded inputs. Either name is accepted wherever a command is named.
+SAME_AS: dict[str, Kind] = {"lock": "latch"}
+
 # Within one tick these come first, in this order: the safest wins
 DOWN: tuple[Kind, ...] = ("latch", "vent", "stop", "lower")
 # these can lift the mirror and are not obeyed in the same tick
-_OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack"})
+_OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack", "unlock"})
 
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
@@ -35,20 +40,25 @@ RUNNING = MOVING | {State.STANDBY, State.CHECK}
 class Command:
     """A request of a person or program."""
 
-    # of `TABLE`, or "resumed": an earlier run resumed within the last day; only the start of a run may send it
-    kind: Kind | Literal["resumed"]
+    # of `TABLE`, or what only the start of a run reports: an earlier run resumed within the last day, or a fault is
+    # still latched
+    kind: Kind | Literal["resumed", "latched"]
     who: str  # recorded, as is `why`
     why: str = ""
     # `setpoint`: um. `manual`: flow, um/s of the centre. `gains`: trial time, s; NaN: no trial. `resumed`: age of the
     # resume, s
     value: float = math.nan
-    text: str = ""  # `mark`: text for the timeline. `latch`: the fault
+    # `mark`: text for the timeline. `latch`: why the mirror is locked. `unlock`: the typed word. `latched`: the fault
+    text: str = ""
     loop: LoopConfig | None = None  # `gains`: all new loop settings
     experiment: ExperimentSpec | None = None  # `tune`: the experiment
     number: int = 0  # chosen by the client, returned with the answer
     shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
     pump: PumpConfig | None = None  # `gains`: the pump's curve, if it changes
     setpoint_step_um: float = math.nan  # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
+    lock: Lock | None = None  # `latch`: the lock, with author, word and time; None: made of the other fields
+    account: str = ""  # login of the sender; empty: none, or not proven
+    from_person: bool = True  # False: sent by a bridge, which speaks for nobody
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +97,16 @@ TABLE: dict[Kind, CommandRule] = {
     "shape_off": CommandRule("operate", ANY, "Switch the shape loop off."),
     "mark": CommandRule("operate", ANY, "Add a remark to the timeline.", needs=("text",)),
     "capture": CommandRule("operate", _HOLD, "Save a full capture set to the run's raw/ folder."),
-    "ack": CommandRule("operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms."),
+    "ack": CommandRule(
+        "operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms; locks stay."
+    ),
     "lower": CommandRule("operate", RUNNING, "Stop the pump; the leak lowers the mirror."),
     "vent": CommandRule("operate", ANY, "Open the vent."),
     "stop": CommandRule("operate", ANY, "End the run safely; never refused."),
-    # a fault of an earlier run, or a person's lock
-    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold until `ack`.", takes=("text",)),
+    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold until `unlock`.", takes=("text",)),
+    "unlock": CommandRule(
+        "operate", ANY, "Remove your lock, or another person's by typing its word.", takes=("text",)
+    ),
 }
 
 
@@ -111,8 +125,8 @@ def overruled(command: Command, obeyed: Collection[str]) -> str:
 
 def refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be executed now; empty if it can."""
-    if command.kind == "resumed":
-        return "" if command.who == AT_START else "only the start of a run may report earlier resumes"
+    if command.kind == "resumed" or command.kind == "latched":
+        return "" if command.who == AT_START else "only the start of a run may report earlier resumes and faults"
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))

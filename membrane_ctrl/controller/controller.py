@@ -6,24 +6,26 @@ and a safe level in force overrules its output. Every path through a tick ends h
 
 import math
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import machine, trial
-from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, sensor_consistency, states
+from membrane_ctrl.controller import commands, locks, pump_obeys, safe_levels, safety, sensor_consistency, states
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.scene import Scene, obey, telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
+from membrane_ctrl.model.lock import describe_locks
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
 _WITHOUT_LASER = "there is no laser whose mount could drift: the optics themselves are held"
+_LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
 _NO_DIGITS = str.maketrans("", "", "0123456789")
 
 
@@ -97,7 +99,7 @@ class Controller:
             laser_lies=consistency.laser_lies,
             runs_on=stand.runs_on,
             inflow=stand.inflow,
-            locked=scene.latched,
+            locked=describe_locks(scene.locks, _LOCKS_SHOWN),
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
             optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
@@ -167,17 +169,18 @@ class Controller:
     def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
-            commands.refusal(command, self.state, self._in_force)
-            or commands.overruled(command, obeyed)
+            commands.overruled(command, obeyed)
+            or locks.refuse_while_locked(command, self._scene.locks)
+            or commands.refusal(command, self.state, self._in_force)
             or self._prepare(command)
         )
         self._answers.append((command.number, refused))
         events.append(commands.taken(command, refused))
         if not refused:
-            self._do(command)
+            self._do(command, events)
         return not refused
 
-    def _do(self, command: commands.Command) -> None:
+    def _do(self, command: commands.Command, events: list[told.Event]) -> None:
         scene = self._scene
         match command.kind:
             case "setpoint" if math.isfinite(self._setpoint_back_um):  # it stays
@@ -196,7 +199,34 @@ class Controller:
                 self._resume.resumed(scene.now_s - command.value)
             case "ack":
                 self._clear_mask = ALL_FAULTS
+            case "latch":
+                self._set_lock(command, events)
+            case "unlock":
+                self._remove_lock(command, events)
         obey(scene, command, self.state)
+
+    def _set_lock(self, command: commands.Command, events: list[told.Event]) -> None:
+        lock = locks.make_lock(command, self._scene.locks)
+        if lock is not None:
+            self._scene.locks = (*self._scene.locks, lock)
+            events.append(told.LockSet(**asdict(lock), number=command.number))
+
+    def _remove_lock(self, command: commands.Command, events: list[told.Event]) -> None:
+        scene = self._scene
+        unlocking = locks.decide_unlock(command, scene.locks)
+        lock = unlocking.lock
+        assert lock is not None  # checked by `refuse_while_locked`
+        scene.locks = tuple(each for each in scene.locks if each != lock)
+        event = told.LockRemoved(
+            word=lock.word,
+            text=lock.text,
+            author=lock.author,
+            set_utc=lock.set_utc,
+            remover=command.who,
+            how=unlocking.reason.value,
+            number=command.number,
+        )
+        events.append(event)
 
     def _prepare(self, command: commands.Command) -> str:
         """Prepare the experiment of a `tune`; returns why the command is refused, or an empty text."""

@@ -46,7 +46,7 @@ class Observation:
     laser_lies: str = ""  # readings of laser, gauge and camera, if the laser is wrong
     runs_on: str = ""  # the read-back of a pump that should have stopped
     inflow: str = ""  # how the mirror rises although the pump is commanded off
-    locked: str = ""  # why a person has locked the mirror
+    locked: str = ""  # the locks that people have set, in words
     vent_fraction: float = math.nan  # the vent's read-back; NaN without one
     foreign: int = 0  # changes by another program: claim, watchdog (`roles.FOREIGN_...`)
     gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
@@ -153,8 +153,8 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=51, name="locked", cause="a person has locked the mirror",
-        limit="ctl ack", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED | {State.FAULT},
-        remedy="ask the person who locked it whether the mirror may move",
+        limit="ctl unlock", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED | {State.FAULT},
+        remedy="ask the person who locked it whether the mirror may move, then `ctl unlock`",
         seen=lambda o: o.locked, broken=lambda o, c: bool(o.locked),
     ),
     Rule(

@@ -13,6 +13,7 @@ from membrane_ctrl.control.experiments.trial import Trial
 from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.model.lock import Lock
 
 # for the record of a tick without an answer; its integers, which have no NaN, are unused
 _NO_READING = BenchReading(
@@ -63,6 +64,7 @@ class Scene:
     stop_exit: errors.Exit = errors.Exit.DONE
     acknowledged: bool = False
     latched: str = ""  # a fault of an earlier run: no hold until a person acknowledges it
+    locks: tuple[Lock, ...] = ()  # set by people: no gas until each is removed
     may_resume: bool = False  # the resume rule clears a latched fault now
     resume_possible: bool = False  # the rule may clear it later
     # memory of the states
@@ -126,8 +128,9 @@ def obey(scene: Scene, command: commands.Command, state: telemetry.State) -> Non
             scene.paused = command.kind == "pause"
         case "setpoint":
             scene.setpoint_um = command.value
+        case "latched":
+            scene.latched = command.text
         case "latch":
-            scene.latched = scene.latched or command.text or f"locked by {command.who}"
             scene.hold_wanted = scene.acknowledged = False
         case "ack":
             scene.latched = ""

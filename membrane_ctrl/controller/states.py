@@ -13,8 +13,10 @@ from membrane_ctrl.control.experiments.machine import BenchSample, Finished
 from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.lock import describe_locks
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
+_LOCKS_SHOWN = 3  # in the operator's line; the status has all of them
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
@@ -24,11 +26,17 @@ _STOP_GIVES_UP_S = 10.0
 
 
 def standby(scene: Scene) -> State:
-    """Keep the pump off until someone requests a hold."""
+    """Keep the pump off until someone requests a hold, and no lock forbids it."""
+    if scene.locks:
+        scene.hold_wanted = False
+        scene.why = f"standby: locked: {describe_locks(scene.locks, _LOCKS_SHOWN)}"
+        return State.STANDBY
     if scene.hold_wanted:
         scene.why = "a hold was requested"
         return State.CHECK
-    scene.why = f"standby: locked: {scene.latched}" if scene.latched else "standby: no hold was requested"
+    scene.why = "standby: no hold was requested"
+    if scene.latched:
+        scene.why = f"standby: a fault is latched: {scene.latched}"
     return State.STANDBY
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.ctl import Where, lock_lines
 from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
@@ -58,6 +58,7 @@ _TEXTS = (
     Published("why", "", "the one-line reason"),
     Published("run", "", "name of the run"),
     Published("fault", "", "the fault with its cause and remedy; empty without one"),
+    Published("locks", "", "the locks: text, author, time and word of each; empty without one"),
     Published("notices", "", "maintenance notices, and what fails in the recording"),
     Published("figure_verdict", "", "verdict on the newest figure"),
     Published("answer", "", "what became of the last command of any door"),
@@ -78,6 +79,7 @@ def values(seen: HoldSeen) -> dict[str, Value]:
         "state": str(status.get("state", "")),
         "why": str(status.get("why") or "as it should be"),
         "fault": "{code} {name}: {cause}; {remedy}".format_map(fault) if fault else "",
+        "locks": "; ".join(lock_lines(status)),
         "notices": "; ".join(notices),
     }
     found |= {each.name: row.get(each.name) for each in _TICK}
@@ -142,6 +144,7 @@ class Door:
             if len(text) > TEXT_BYTES:  # the port would drop a client that sends too much
                 raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
             asked = request(action, f"door: {by}", text)
+            asked["on_behalf"] = {"via": "bridge", "name": by, "role": self.settings.role}
         except ValueError as error:
             return str(error)
         return await self._in_turn(asked)

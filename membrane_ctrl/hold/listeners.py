@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 
-from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.controller import tick
 from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
@@ -74,7 +74,7 @@ class FaultLatch:
         self._report()
 
     def heard(self, outputs: tick.TickOutputs) -> None:
-        """After a tick: latch a fault or a person's lock; clear an acknowledged one."""
+        """After a tick: latch a fault; clear an acknowledged one."""
         self._report()
         for event in outputs.events:
             match event:
@@ -82,9 +82,6 @@ class FaultLatch:
                     self._fault = event
                 case events.StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
-                case events.CommandTaken(command="latch", who=who, refused=None) if who != commands.AT_START:
-                    # a latch from the start is already in the file
-                    self._lock(who, event.text or "", outputs.row.mono_s)
                 case events.Resumed() if self._resumes is not None:
                     self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
                 case events.StateEntered(from_="fault") | events.CommandTaken(command="ack", refused=None) if (
@@ -96,12 +93,6 @@ class FaultLatch:
         words = {key: getattr(self._fault, key, "") for key in ("name", "cause", "seen", "remedy")}
         if self._file is not None:
             self._write(partial(self._file.write, self._dated(words, now_s)))
-
-    def _lock(self, who: str, text: str, now_s: float) -> None:
-        remedy = "ask the person who locked it whether the mirror may move"
-        words = {"name": "locked", "cause": text or "by hand", "seen": f"by {who}", "remedy": remedy}
-        if self._file is not None:
-            self._write(partial(self._file.add, self._dated(words, now_s)))
 
     def _dated(self, words: dict[str, str], now_s: float) -> LatchedFault:
         return LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
@@ -165,6 +156,8 @@ class SystemdNotify:
 
     def heard(self, outputs: tick.TickOutputs) -> None:
         """After a tick: notify, at most twice a second unless the state changes."""
+        for event in outputs.events:
+            self._status = self._status.after_event(event)
         row = outputs.row
         if row.mono_s < self._next_s and row.state == self._state:
             return
@@ -172,8 +165,11 @@ class SystemdNotify:
         self._next_s, self._state = row.mono_s + _NOTIFY_S, row.state
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
+        locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
         trouble = f", recording: {self._status.recording_words}" if self._status.recording else ""
-        self._send(f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{trouble}")
+        self._send(
+            f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{locked}{trouble}"
+        )
 
     def _send(self, message: str) -> None:
         if self._address:

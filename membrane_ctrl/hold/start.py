@@ -13,7 +13,7 @@ import math
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -29,15 +29,22 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
+from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench
+from membrane_ctrl.instruments.lock_store import LockStore, device_keys, require_unlocked
 from membrane_ctrl.model import errors, events, run_events, terminal
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
 
+_UNLOCKS = "start with --standby, then `membrane-ctrl ctl unlock WORD`; or `membrane-ctrl locks remove WORD`"
 _NICE, _ENDS_S = 10, 10.0  # of the tuning session
+
+
+_STORES_NONE = partial(LockKeeper, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +91,7 @@ def hold_mirror(options: HoldOptions) -> int:
         config = twin.config if twin else options.config
         assert config.devices is not None
         stack.enter_context(locked(device_names(config.devices)))  # one with other folders ends here
+        lock_storage = _find_locks(config, options)  # before anything is cleared
         latched = _latched(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
         terminal.progress(f"connecting to {config.devices.name}")
@@ -102,7 +110,10 @@ def hold_mirror(options: HoldOptions) -> int:
         bench = open_bench(config.devices)  # a link belongs to the event loop that opened it
         port = partial(server.Port, config.port, listeners, run_dir.name)
         latch = partial(FaultLatch, latched, resumes, run_dir.name, clock.utc)
-        exit_code = asyncio.run(_run(bench, config, options, clock, rings, children, twin, port, latch, board))
+        keeper = partial(LockKeeper, lock_storage)
+        exit_code = asyncio.run(
+            _run(bench, config, options, clock, rings, children, twin, port, latch, board, keeper)
+        )
         children.take_down()
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
         report(run_dir, options.json)
@@ -139,6 +150,22 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fa
     elif fault is not None and not options.standby:
         raise errors.DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
     return file
+
+
+def _find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
+    """Return where the run keeps its locks, with those that are set; the twin keeps them only if configured.
+
+    Raises DeviceError if there are any, unless the run starts in standby, where a person can remove them.
+    """
+    if options.twin and not config.states.latch_twin_faults:
+        return None
+    assert config.devices is not None
+    store = LockStore.of_machine()
+    # the twin's own port may be another one at each start
+    devices = frozenset({f"twin port {options.config.twin.port}"}) if options.twin else device_keys(config.devices)
+    if not options.standby:
+        require_unlocked(store, devices, _UNLOCKS)
+    return LockStorage(store, devices, tuple(store.find_locks(devices)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +233,9 @@ async def _run(
     port_for: Callable[[server.RunHooks], server.Port],
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
+    keeper_for: Callable[[Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper] = (
+        _STORES_NONE
+    ),
 ) -> errors.Exit:
     from membrane_ctrl.metrology.optics.film_law import zernike_projection
 
@@ -215,9 +245,12 @@ async def _run(
         controller = Controller(config, zernike_projection())
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
-        port = port_for(server.RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings))
+        keeper = keeper_for(lambda event: _tell_all(event, supervisor, wiring), supervisor.ask)
+        hooks = server.RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome)
+        port = port_for(hooks)
         latch, systemd = latch_for(supervisor.tell), SystemdNotify()
         wiring.heard = {
+            "locks": keeper.heard,  # before the port, which asks for the outcome
             "control port": port.heard,
             "latched-fault file": latch.heard,
             "systemd": systemd.heard,
@@ -227,11 +260,11 @@ async def _run(
         supervisor.tell(run_events.Started(config.devices.name, child.raise_priority(), board.cleared))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
-            _ask_first(supervisor, options.standby, latch, board)
+            _ask_first(supervisor, options.standby, latch, board, keeper.at_start)
             gc.collect()
             gc.freeze()  # the collector need not visit objects that live for the whole run
             async with port.open():
-                with _signals(supervisor), latch, systemd:
+                with _signals(supervisor), latch, keeper, systemd:
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
                         supervisor.tell(run_events.NoClaim(NO_CLAIM))
@@ -244,6 +277,13 @@ async def _run(
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
             supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
     return exit_code
+
+
+def _tell_all(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
+    """Record an event, and pass it on as a child's report."""
+    supervisor.tell(event)
+    for told in wiring.told.values():
+        told(event)
 
 
 def _wiring(
@@ -263,12 +303,16 @@ def _wiring(
     return Wiring(bench, telemetry, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports)
 
 
-def _ask_first(supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart) -> None:
-    """The first tick's commands: hold, unless the run starts in standby, and the resumes of earlier runs."""
+def _ask_first(
+    supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart, locks: Sequence[Lock] = ()
+) -> None:
+    """The first tick's commands: hold, unless the run starts in standby; locks, faults, resumes of earlier runs."""
+    for lock in locks:
+        supervisor.ask(commands.Command("latch", commands.AT_START, text=lock.text, lock=lock))
     if not standby:
         supervisor.ask(commands.Command("hold", commands.AT_START))
     elif latched := "; ".join(part for part in (latch.latched, board.latched) if part):
-        supervisor.ask(commands.Command("latch", commands.AT_START, text=latched))
+        supervisor.ask(commands.Command("latched", commands.AT_START, text=latched))
     for age_s in latch.resumes_s:
         supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
 

@@ -100,6 +100,30 @@ class CommandTaken(Event, kind="command"):
     refused: str | None = None
 
 
+class LockSet(Event, kind="lock"):
+    """A person locked the mirror, or the run started with a lock of an earlier one."""
+
+    word: str
+    text: str
+    author: str
+    account: str
+    session: str
+    set_utc: str
+    number: int  # of the request; 0: from the start of the run
+
+
+class LockRemoved(Event, kind="unlock"):
+    """A person removed a lock: its author, or somebody who typed its word (`how`)."""
+
+    word: str
+    text: str
+    author: str
+    set_utc: str
+    remover: str
+    how: str
+    number: int
+
+
 class GainsReverted(Event, kind="gains_reverted"):
     """Gains on trial were reverted."""
 
@@ -164,6 +188,10 @@ _SENTENCES = {
     "resumed": "Fault {name} is cleared by the resume rule",
     "shape": "Shape loop {state}[: {reason}]",
     "command": 'Command {command}[ {value:g} {unit}][ "{text}"][ by {who}][: {why}][. Refused: {refused}]',
+    "lock": 'Locked by {author}[ ({session})][, {set_utc}]: "{text}", word {word}',
+    "unlock": 'Lock "{text}" of {author} removed by {remover} (by its {how})',
+    "lock_not_stored": "The lock {word} is not stored: {message}. Do: mend the disk, the lock ends with this run",
+    "lock_stored": "The lock {word} is stored now",
     "gains_reverted": "Gains on trial are reverted: {why}",
     "experiment": "Experiment {experiment} ended[: {reason}]",
     "plausibility": "Laser and camera disagree ({seen}). Do: check the laser's mount, the camera and the screen",
@@ -198,10 +226,12 @@ _PART = re.compile(r"\[([^\]]*)\]")
 _FIELD = re.compile(r"{(\w+)")
 _NOT_TOLD = frozenset({"time_utc", "mono_s", "kind", "crc32"})
 
-_ERRORS = frozenset({"fault", "recorder_error", "unreadable_event", "latch_failed", "child_given_up"})
+_ERRORS = frozenset(
+    {"fault", "recorder_error", "unreadable_event", "latch_failed", "lock_not_stored", "child_given_up"}
+)
 _WARNINGS = frozenset({
     "disk_low", "plausibility", "maintenance", "gains_reverted", "inputs_not_recorded", "shape_unreadable",
-    "child_ended", "child_silent", "port_failed", "refused", "no_claim", "raw_frames",
+    "child_ended", "child_silent", "port_failed", "refused", "no_claim", "raw_frames", "lock",
 })  # fmt: skip
 
 

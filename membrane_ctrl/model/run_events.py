@@ -57,6 +57,19 @@ class LatchFailed(Event, kind="latch_failed"):
     message: str
 
 
+class LockNotStored(Event, kind="lock_not_stored"):
+    """A lock, or its removal, is not on the disk."""
+
+    word: str
+    message: str
+
+
+class LockStored(Event, kind="lock_stored"):
+    """A lock, or its removal, that had failed is on the disk now."""
+
+    word: str
+
+
 class LatchWritten(Event, kind="latch_written"):
     """The latched fault's file is written again."""
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model.lock import Lock
 
 
 class State(IntEnum):
@@ -175,6 +176,9 @@ class RunStatus:
     recording: Mapping[str, str] = field(default_factory=dict)
     loop: Mapping[str, Any] | None = None  # gains set during the run; None: those of the configuration
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
+    locks: tuple[Lock, ...] = ()  # set by people, oldest first
+    unstored: Mapping[str, str] = field(default_factory=dict)  # by a lock's word: why it is not on the disk
+    latched: str = ""  # a fault of an earlier run that waits for `ack`
     trial_ends_s: float = math.nan  # when gains on trial are reverted; NaN: none are
     ended: bool = False
 
@@ -214,6 +218,20 @@ class RunStatus:
                 return replace(self, loop=loop, kept_loop=kept, trial_ends_s=ends_s)
             case events.CommandTaken(command="keep", refused=None):
                 return replace(self, kept_loop=self.loop, trial_ends_s=math.nan)
+            case events.CommandTaken(command="latched", text=text):
+                return replace(self, latched=text or "")
+            case events.CommandTaken(command="ack", refused=None):
+                return replace(self, latched="")
+            case events.LockSet():
+                lock = Lock(event.word, event.text, event.author, event.account, event.session, event.set_utc)
+                return replace(self, locks=(*self.locks, lock))
+            case events.LockRemoved(word=word):
+                kept_locks = tuple(lock for lock in self.locks if lock.word != word)
+                return replace(self, locks=kept_locks, unstored=_without(self.unstored, word))
+            case run_events.LockNotStored():
+                return replace(self, unstored={**self.unstored, event.word: event.message})
+            case run_events.LockStored():
+                return replace(self, unstored=_without(self.unstored, event.word))
             case events.GainsReverted():
                 return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
             case events.Maintenance():

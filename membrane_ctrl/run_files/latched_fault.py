@@ -68,11 +68,6 @@ class LatchedFile:
         with contextlib.suppress(OSError):
             self.reserve()
 
-    def add(self, fault: LatchedFault) -> None:
-        """Latch, unless a fault is latched already: the first cause is the one to report. Raises OSError."""
-        if self.read() is None:
-            self.write(fault)
-
     def reserve(self) -> None:
         """Reserve disk space for a fault, so that one on a full disk latches too. Raises OSError."""
         self._fill(bytes(_RESERVE_BYTES))

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.control_port.client import PortClient
-from membrane_ctrl.control_port.ctl import Where, socket_path
+from membrane_ctrl.control_port.ctl import Where, lock_lines, socket_path
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import Event
@@ -161,7 +161,9 @@ def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool
     client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
     try:
         while wait and client.ask(do="status")["status"].get("state") != "hold":
+            _require_unlocked(client)
             time.sleep(_POLL_S)
+        _require_unlocked(client)
         if needs_operate and client.greeting["role"] == "read":
             raise errors.InputError(f"{needs_operate} needs the role operate; {client.greeting['you']} has read")
         link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over)
@@ -170,6 +172,13 @@ def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool
         raise
     with contextlib.closing(link):
         yield link
+
+
+def _require_unlocked(client: PortClient) -> None:
+    """Raise DeviceError if the mirror is locked: the hold would refuse every experiment."""
+    lines = lock_lines(client.ask(do="status").get("status") or {})
+    if lines:
+        raise errors.DeviceError(f"locked: {'; '.join(lines)}; ask its author, then `membrane-ctrl ctl unlock WORD`")
 
 
 # Progress of a step and the time left, on stderr: a live line on a terminal, otherwise a line per minute.

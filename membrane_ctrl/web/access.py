@@ -53,6 +53,7 @@ class WebUser:
 
     name: str
     role: Role
+    has_login: bool = field(default=False, compare=False)  # with a password; a link proves no name
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,7 @@ class Accounts:
         salt, digest = (known.salt, known.digest) if known else (b"\0" * 16, b"")
         if known is not None and hmac.compare_digest(_digest(password, salt), digest):
             self._wrong.pop(name, None)
-            return WebUser(known.name, known.role)
+            return WebUser(known.name, known.role, has_login=True)
         if known is None:
             _digest(password, salt)  # as slow as for a name that exists
         else:
@@ -298,6 +299,7 @@ def _states(do: str) -> frozenset[str]:
 
 
 STOP = Action("stop", "STOP", "stop_circle")
+UNLOCK = Action("unlock", "Unlock", "lock_open", "text")  # none of `ACTIONS`, which the bridges offer as well
 ACTIONS = (
     Action("hold", "Hold", "play_arrow"),
     Action("pause", "Pause", "pause"),
@@ -325,6 +327,23 @@ def outranks(role: str, needed: Role) -> bool:
 def may(user: WebUser, port_role: str, action: Action) -> bool:
     """Whether the viewer's role and that of this process at the port both allow it."""
     return outranks(user.role, action.role) and outranks(port_role, action.role)
+
+
+def on_behalf(user: WebUser, session: str) -> dict[str, str]:
+    """What the page states of a viewer in each request (`protocol.OnBehalf`).
+
+    Parameters
+    ----------
+    user : WebUser
+    session : str
+        Of the viewer.
+
+    Returns
+    -------
+    dict
+    """
+    account = user.name if user.has_login else ""
+    return {"via": "page", "account": account, "name": user.name, "session": session, "role": user.role}
 
 
 def request(action: Action, why: str, given: str, take_over: bool = False) -> dict[str, Any]:

@@ -145,7 +145,11 @@ class HoldFeed:
                 answer = client.ask(**request)
         except errors.CommandError as error:
             return f"{what}: {'; '.join(error.lines)}"
-        return f"{what}: done" if answer.get("ok") else f"{what} refused: {answer.get('refused')}"
+        if not answer.get("ok"):
+            return f"{what} refused: {answer.get('refused')}"
+        if answer.get("problem"):
+            return f"{what}: not stored, only this run knows: {answer['problem']}"
+        return f"{what}: done"
 
     def _follow(self) -> None:
         while not self._ending.is_set():

@@ -11,8 +11,9 @@ from urllib.parse import urlencode
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.ctl import lock_lines
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
+from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history, marks
 from membrane_ctrl.web.panels import (
     CHOOSES,
@@ -26,6 +27,7 @@ from membrane_ctrl.web.panels import (
 )
 
 _LOOK_S = 1.0
+_SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
 _FIGURES = (
@@ -82,6 +84,7 @@ class WebPage:
         self._coloured = ""
         self._buttons: list[tuple[ui.button, Action]] = []
         self._asking = False
+        self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"  # of this viewer, in records
 
     def build(self) -> None:
         """Put the page together."""
@@ -160,7 +163,7 @@ class WebPage:
 
     def _build_actions(self) -> None:
         with ui.grid(columns=3).classes("w-full gap-1"):
-            for action in ACTIONS:
+            for action in (*ACTIONS, UNLOCK):
                 button = ui.button(action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a))
                 button.props("dense no-caps stack").tooltip(action.does)
                 self._buttons.append((button, action))
@@ -250,6 +253,10 @@ class WebPage:
         with ui.dialog() as dialog, ui.card():
             ui.label(action.label).classes("text-h6")
             ui.label(action.does)
+            if action is UNLOCK:
+                ui.label("Type the word of the lock, or nothing for your own lock:")
+                for line in lock_lines(self._feed.seen.status):
+                    ui.label(line).classes("text-negative text-bold")
             given = None
             if action.asks:  # a hidden one would take the focus, and Enter with it
                 given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").classes("w-full")
@@ -279,5 +286,6 @@ class WebPage:
         except ValueError as error:
             tell(str(error), good=False)
             return
+        asked["on_behalf"] = on_behalf(self._user, self._session)
         said = await asyncio.to_thread(self._feed.ask, asked)
         tell(said, said.endswith(": done"))

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.ctl import lock_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
@@ -44,9 +45,10 @@ def tell(text: str, good: bool | None = None) -> None:
 
 
 def alarms_of(status: Mapping[str, Any]) -> str:
-    """The fault, the maintenance notices and what the recording lacks, in one line."""
+    """The locks, the fault, the maintenance notices and what the recording lacks, in one line."""
     fault = status.get("fault")
-    lines = [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
+    lines = [f"LOCKED {line}" for line in lock_lines(status)]
+    lines += [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
     lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
     return "; ".join(lines)
 

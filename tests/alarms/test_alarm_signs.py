@@ -45,6 +45,10 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "plausibility", "liar": "nobody"}, [("plausibility", False, "warning")]),
         ({"kind": "latch_failed", "message": "disk full"}, [("latch", True, "critical")]),
         ({"kind": "latch_written"}, [("latch", False, "warning")]),
+        ({"kind": "lock", "word": "bofak"}, [("lock", True, "warning")]),
+        ({"kind": "unlock", "word": "bofak"}, [("lock", False, "warning"), ("lock_storage", False, "warning")]),
+        ({"kind": "lock_not_stored", "word": "bofak", "message": "disk full"}, [("lock_storage", True, "critical")]),
+        ({"kind": "lock_stored", "word": "bofak"}, [("lock_storage", False, "warning")]),
         ({"kind": "end", "exit": "safety_trip"}, [("run_ended", True, "critical")]),
         ({"kind": "end", "exit": "done"}, []),
         ({"kind": "end", "exit": "interrupted"}, []),
@@ -105,3 +109,11 @@ def test_the_text_names_value_and_limit() -> None:
 def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) -> None:
     with pytest.raises(InputError, match=says):
         parse({"alarms": alarms}, Config, "lab.toml")
+
+
+def test_the_notice_of_a_lock_names_text_author_time_and_word() -> None:
+    line = {"kind": "lock", "word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
+    (sign,) = signs_of(from_dict(line))
+    assert sign.about == "bofak"
+    for part in ("hands inside", "unix:ann", "2026-01-02", "bofak"):
+        assert part in sign.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import getpass
 import json
 import socket
 import threading
@@ -20,8 +21,8 @@ from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.instruments.bench import device_names, locked, pump_board
+from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore, device_keys
 from membrane_ctrl.model.errors import DeviceError
-from membrane_ctrl.run_files.latched_fault import LatchedFile
 from tests.support.faulty_board import PumpBoardEmulator
 
 STOPPED, WATCHDOG = 0b100, 0b001
@@ -102,9 +103,9 @@ def test_it_stops_the_pump_under_a_holder_and_changes_nothing_of_his(
     assert bench.board.state.read(48, 2) == before
     bench.now_s += 0.51
     assert bench.read().watchdog_tripped  # it has not fed
-    fault = LatchedFile(tmp_path).read()
-    assert fault is not None
-    assert (fault.name, fault.cause) == ("locked", "made safe by hand")
+    (stored,) = LockStore.of_machine().find_locks(device_keys(bench.devices))
+    assert stored.lock.text == "made safe by hand"
+    assert stored.lock.account == f"unix:{getpass.getuser()}"
 
 
 def test_a_board_with_claims_keeps_it_stopped_until_the_holder_clears_it(bench: Bench) -> None:
@@ -122,16 +123,13 @@ def test_it_waits_for_no_lock(bench: Bench) -> None:
     assert bench.read().pump_fraction == 0.0
 
 
-def test_what_is_latched_already_is_kept_and_a_folder_that_cannot_be_written_is_said(
-    bench: Bench, tmp_path: Path
+def test_locks_that_cannot_be_written_are_reported_with_the_pump_stopped(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "latched-fault.json"
-    file.write_text(json.dumps({"schema": "other"}))
-    make_safe(bench.config, "lab.toml")
-    assert "other" in file.read_text()
-    (tmp_path / "logs").write_text("no folder")
-    with pytest.raises(DeviceError, match=r"the pump is stopped, but not latched"):
-        make_safe(bench.config, "lab.toml", tmp_path / "logs")
+    (tmp_path / "locks").write_text("no folder")
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "locks"))
+    with pytest.raises(DeviceError, match=r"the pump is stopped, but not locked"):
+        make_safe(bench.config, "lab.toml")
     assert bench.read().pump_fraction == 0.0
 
 
@@ -139,7 +137,7 @@ def test_after_a_run_nothing_is_latched(bench: Bench, tmp_path: Path) -> None:
     bench.write(0.0)
     bench.at_once(bench.holder.close)
     assert make_safe(bench.config, "lab.toml", latch=False) == 0
-    assert LatchedFile(tmp_path).read() is None
+    assert LockStore.of_machine().find_locks() == []
     bench.at_once(bench.holder.open)
     assert bench.read().latched_faults == 0
 
@@ -229,20 +227,23 @@ def composed(folder: Path) -> Config:
     return Config(devices=DevicesConfig.model_validate(roles), recording=recording)
 
 
-@pytest.mark.parametrize("answer", [{"ok": True}, {"ok": False, "refused": "not you"}])
-def test_a_running_hold_is_told_to_latch_and_that_is_enough_where_it_alone_has_the_pump(
+STORED = {"ok": True, "stored": True, "lock": {"word": "bofak"}}
+
+
+@pytest.mark.parametrize("answer", [{"ok": True}, STORED, {"ok": False, "refused": "not you"}])
+def test_a_running_hold_is_locked_and_that_is_enough_where_it_alone_has_the_pump(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], answer: dict[str, object]
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
     hold = Hold(tmp_path / "control.sock", answer)
     if answer["ok"]:
         assert make_safe(composed(tmp_path), "lab.toml") == 0
-        assert "run night: latched" in capsys.readouterr().err
-        assert LatchedFile(tmp_path).read() is not None
+        assert "run night: locked" in capsys.readouterr().err
+        assert bool(LockStore.of_machine().find_locks()) == ("stored" not in answer)
     else:
         with pytest.raises(DeviceError, match="cut the pump's power"):
             make_safe(composed(tmp_path), "lab.toml")
-        assert "refused to latch: not you" in capsys.readouterr().err
+        assert "refused the lock: not you" in capsys.readouterr().err
     hold.close()
     assert [request["do"] for request in hold.asked] == ["latch"]
 

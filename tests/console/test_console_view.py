@@ -128,7 +128,7 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     model = ConsoleModel(CONFIG, ctl="membrane-ctrl ctl --socket x/control.sock", keys=True)
     model.take_row(replace(HOLDING, state=State.STANDBY))
     assert any("go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row for row in drawn(model, 0.0))
-    model.take_event(event(0.0, "why", why="standby: locked: hands inside"))
+    model.take_event(event(0.0, "command", command="latched", who="command line", why="", text="over_pressure"))
     view = model.view(0.0)
     assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
     assert line(view).endswith(view.go_on)
@@ -137,6 +137,32 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     model.take_event(event(0.0, "why", why="paused: the pump keeps its mean flow"))
     assert model.view(0.0).paused
     assert model.view(0.0).go_on.endswith("resume` or key p")
+
+
+def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_removed() -> None:
+    model = ConsoleModel(CONFIG, ctl="ctl", keys=True)
+    model.take_row(replace(HOLDING, state=State.STANDBY))
+    for word, author in (("bofak", "unix:ann"), ("gumil", "page:bob")):
+        fields = {
+            "word": word,
+            "author": author,
+            "account": author,
+            "session": "s",
+            "set_utc": "2026-01-02",
+            "number": 1,
+        }
+        model.take_event(event(0.0, "lock", text="hands inside", **fields))
+    page = " ".join(" ".join(drawn(model, 0.0)).replace("│", " ").split())
+    for author, word in (("unix:ann", "bofak"), ("page:bob", "gumil")):
+        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in page
+        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in line(model.view(0.0))
+    assert model.view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
+    removed = {"text": "", "author": "", "set_utc": "", "remover": "", "how": "word", "number": 2}
+    model.take_event(event(0.0, "unlock", word="bofak", **removed))
+    assert model.view(0.0).go_on == "go on: ask page:bob, then `ctl unlock gumil`"
+    model.take_event(event(0.0, "unlock", word="gumil", **removed))
+    assert model.view(0.0).locks == ()
+    assert "hold" in model.view(0.0).go_on
 
 
 def test_fault_and_its_remedy_are_seen() -> None:

@@ -6,6 +6,7 @@ import asyncio
 import json
 import socket
 from collections.abc import AsyncIterator
+from concurrent.futures import Future
 from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -57,7 +58,8 @@ class PortRun:
         more = port_config.model_copy(update={"socket": str(folder / "unused.sock")})
         others = listeners_for(more, folder, self._stack)
         self.listeners = Listeners(self.listener, others.tls, others.metrics, self.path)
-        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop, PumpConfig)
+        self.outcomes: dict[int, Future[str]] = {}  # of storing locks, by number of the command
+        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop, PumpConfig, self.outcomes.get)
         self.port = Port(port_config, self.listeners, "the-run", hooks)
 
     async def somebody_asked(self) -> None:

@@ -14,7 +14,7 @@ from membrane_ctrl.control_port import ctl as port_ctl
 from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
 from membrane_ctrl.control_port.server import status_table
-from membrane_ctrl.controller.commands import TABLE
+from membrane_ctrl.controller.commands import SAME_AS, TABLE
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_events import GeometryInForce, from_dict
 from membrane_ctrl.model.telemetry import RunStatus, State
@@ -35,7 +35,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
 
 def test_there_is_an_action_for_every_command_but_tune() -> None:
     shape = {"shape_on", "shape_off"}
-    assert {*ACTIONS, *shape} == {*TABLE, *get_args(protocol.Errand), "shape"} - {"tune"}
+    assert {*ACTIONS, *shape} == {*TABLE, *SAME_AS, *get_args(protocol.Errand), "shape"} - {"tune"}
 
 
 @pytest.mark.parametrize("action", ACTIONS)
@@ -45,9 +45,17 @@ def test_every_action_is_a_request_that_the_port_reads(action: str, asked: Asked
     assert protocol.parse(json.dumps(asked[0]).encode()).why == "test"
 
 
-def test_a_lock_may_say_why(asked: Asked) -> None:
-    assert run(["ctl", "latch", "hands inside"]) == 0
-    assert protocol.parse(json.dumps(asked[0]).encode()).text == "hands inside"
+@pytest.mark.parametrize("name", ["lock", "latch"])
+def test_a_lock_has_two_names_and_may_say_why(name: str, asked: Asked) -> None:
+    assert run(["ctl", name, "hands inside"]) == 0
+    request = protocol.parse(json.dumps(asked[0]).encode())
+    assert (request.do, request.text) == ("latch", "hands inside")
+
+
+def test_an_unlock_takes_the_word(asked: Asked) -> None:
+    assert run(["ctl", "unlock", "bofak"]) == 0
+    request = protocol.parse(json.dumps(asked[0]).encode())
+    assert (request.do, request.text) == ("unlock", "bofak")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import copy
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -32,8 +33,8 @@ CONFIG = Config(
 SPEC = ExperimentSpec.model_validate(
     {"kind": "relay", "duration_s": 20.0, "holding_flow_um_per_s": 1.24, "laser_um": 1.0}
 )
-LIFTING: tuple[Kind, ...] = ("hold", "manual", "tune", "resume", "ack")
-RISKY: tuple[Kind, ...] = ("hold", "ack", "manual", "resume", "stop", "lower", "vent")
+LIFTING: tuple[Kind, ...] = ("hold", "manual", "tune", "resume", "ack", "unlock")
+RISKY: tuple[Kind, ...] = ("hold", "ack", "unlock", "manual", "resume", "stop", "lower", "vent")
 
 
 def command(kind: Kind) -> Command:
@@ -42,7 +43,8 @@ def command(kind: Kind) -> Command:
         kind,
         "tester",
         value=values.get(kind, math.nan),
-        text="hands inside",
+        text="" if kind == "unlock" else "hands inside",
+        account="tester" if kind in ("latch", "unlock") else "",
         loop=CONFIG.loop if kind == "gains" else None,
         experiment=SPEC if kind == "tune" else None,
     )
@@ -57,16 +59,21 @@ class Mirror:
         self.last: TickOutputs | None = None
 
     def tick(self, *kinds: Kind, **wrong: float) -> TickOutputs:
+        return self.tick_with([command(kind) for kind in kinds], **wrong)
+
+    def tick_with(self, given: Sequence[Command], **wrong: float) -> TickOutputs:
         self.ticks += 1
+        self.last = self.controller.tick(self.inputs(given, **wrong))
+        return self.last
+
+    def inputs(self, given: Sequence[Command], **wrong: float) -> TickInputs:
         pump = self.last.command.pump_fraction if self.last else 0.0
         below_um = -1.5 + 1e-3 * (self.ticks % 7)  # inside the band, and so that the loop wants gas
         reading = BenchReading(
             below_um, 0, 600.0, 101325.0, 23.0, 23.0, pump, 0.0, self.ticks, DT_S * self.ticks, False, 0
         )
         reading = replace(reading, **wrong)  # type: ignore[arg-type]  # numbers all of them
-        inputs = TickInputs(self.ticks * DT_S, DT_S, reading, commands=tuple(command(kind) for kind in kinds))
-        self.last = self.controller.tick(inputs)
-        return self.last
+        return TickInputs(self.ticks * DT_S, DT_S, reading, commands=tuple(given))
 
     def until(self, state: State) -> Mirror:
         for _ in range(60):
@@ -104,10 +111,10 @@ def in_state(state: State) -> Mirror:
 
 
 def stays_down(mirror: Mirror) -> None:
-    """Whatever is commanded except `ack`, again and again, the pump stays off."""
+    """Whatever is commanded except `unlock`, again and again, the pump stays off."""
     assert mirror.last is not None
     assert mirror.last.command.pump_fraction == 0.0
-    for kind in ("hold", "manual", "resume", "lower", "hold", "hold", "hold", "hold"):
+    for kind in ("hold", "ack", "manual", "resume", "lower", "ack", "hold", "hold", "hold", "hold"):
         assert mirror.tick(kind).command.pump_fraction == 0.0
         assert mirror.controller.state not in MOVING | {State.CHECK}
 
@@ -136,12 +143,13 @@ def orders(*kinds: Kind) -> set[tuple[Kind, ...]]:
 @pytest.mark.parametrize(
     "state", [State.STANDBY, State.HOLD, State.MANUAL, State.FAULT], ids=lambda state: state.name
 )
-def test_after_a_latch_an_ack_of_its_own_tick_lets_the_mirror_be_held_again(state: State) -> None:
+def test_after_a_latch_an_unlock_and_an_ack_let_the_mirror_be_held_again(state: State) -> None:
     """The tests above would not notice a controller that never inflates again."""
     mirror = in_state(state)
-    mirror.tick("latch", "ack")
+    mirror.tick("latch", "ack", "unlock")
     for _ in range(10):
         mirror.tick()
+    mirror.tick("unlock")
     mirror.tick("ack")
     mirror.until(State.STANDBY)
     mirror.tick("hold")

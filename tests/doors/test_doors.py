@@ -116,6 +116,26 @@ async def test_a_door_asks_by_its_role(tmp_path: Path, role: str, command: str, 
         assert (command in door.commands) is not refused
 
 
+async def test_a_door_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> None:
+    async with port_run(tmp_path) as run:
+        door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        assert "done" in await door.ask("mqtt", "latch", "hands inside")
+        (command,) = run.asked
+        assert command.lock is not None
+        assert (command.lock.text, command.lock.author, command.lock.account) == ("hands inside", "bridge:mqtt", "")
+        assert not command.from_person
+        assert "no such command" in await door.ask("mqtt", "unlock", command.lock.word)
+        assert run.asked == [command]
+
+
+def test_the_locks_are_published() -> None:
+    seen = seen_hold()
+    lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
+    assert values(seen)["locks"] == ""
+    seen = dataclasses.replace(seen, status={**seen.status, "locks": [lock, lock]})
+    assert str(values(seen)["locks"]).count('"hands inside" by unix:ann, 2026-01-02, word bofak') == 2
+
+
 async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
     door = door_with("tune", dataclasses.replace(seen_hold(), role="read"))
     assert "stop refused: needs the role operate" in await door.ask("epics", "stop")

@@ -24,7 +24,7 @@ def refusals(run: VirtualRun, *commands: Command) -> list[str]:
 
 def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:
     run = VirtualRun(CONFIG, VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), zernike_projection())
-    assert refusals(run, Command("latch", "command line", text="over_pressure: 801 Pa")) == [""]
+    assert refusals(run, Command("latched", "command line", text="over_pressure: 801 Pa")) == [""]
     (refused,) = refusals(run, Command("hold", "night shift"))
     assert "over_pressure: 801 Pa" in refused
     for _ in range(50):
@@ -38,9 +38,19 @@ def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:
     assert tick.row.state == State.CHECK
 
 
+def test_only_the_start_of_a_run_reports_a_latched_fault() -> None:
+    run = VirtualRun(CONFIG, VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), zernike_projection())
+    (refused,) = refusals(run, Command("latched", "somebody", text="nothing"))
+    assert "only the start of a run" in refused
+    assert refusals(run, Command("hold", "somebody")) == [""]
+
+
 def test_a_person_can_lock_the_mirror() -> None:
     run = VirtualRun(CONFIG, VirtualBench(Plant(CONFIG.twin, CONFIG.pump)), zernike_projection())
-    assert refusals(run, Command("latch", "engineer")) == [""]
+    assert refusals(run, Command("latch", "engineer", account="engineer")) == [""]
     (refused,) = refusals(run, Command("hold", "somebody"))
-    assert "locked by engineer" in refused
-    assert refusals(run, Command("ack", "engineer"), Command("hold", "engineer")) == ["", ""]
+    assert '"locked by hand" by engineer' in refused
+    ack, hold = refusals(run, Command("ack", "engineer"), Command("hold", "engineer"))
+    assert (ack, hold) == ("", refused)
+    unlock = Command("unlock", "engineer", account="engineer")
+    assert refusals(run, unlock, Command("hold", "engineer")) == ["", ""]

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.roles import BenchCommand
-from membrane_ctrl.controller.commands import AT_START
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
@@ -109,23 +108,10 @@ def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> N
     assert not told
 
 
-LOCK = CommandTaken("latch", "unix:ann", "", text="hands inside")
-
-
-def test_a_lock_outlives_its_run_and_does_not_hide_a_fault(tmp_path: Path) -> None:
+def test_a_lock_is_no_latched_fault(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(replace(LOCK, refused="not now")))
-        fault_latch.heard(outputs(replace(LOCK, who=AT_START)))
+        fault_latch.heard(outputs(CommandTaken("latch", "unix:ann", "", text="hands inside")))
     assert LatchedFile(tmp_path).read() is None
-    with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(LOCK))
-    assert "hands inside (by unix:ann)" in str(LatchedFile(tmp_path).read())
-    with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(ACK, *TRIP))
-        fault_latch.heard(outputs(LOCK))
-    found = LatchedFile(tmp_path).read()
-    assert found is not None
-    assert found.name == "late"
 
 
 def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:

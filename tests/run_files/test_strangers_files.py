@@ -159,8 +159,10 @@ _OWN = {
     "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
-    "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/sockets.py",
+    "run_files/latched_fault.py", "run_files/disk_budget.py", "control_port/sockets.py",
     "sessions/folder.py", "sessions/live_log.py", "web/panels.py",
+    # the machine's own folder of locks, whose owner and mode are checked
+    "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",

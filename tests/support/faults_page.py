@@ -49,7 +49,7 @@ def faults_page() -> str:
         "first cause of a fault is the one reported. Every level below `hold_flow` latches: the state is `fault`",
         "until a person acknowledges it, or until the cause has been absent for `resume.wait_s`, provided that",
         "the rule's name is in `resume.faults` and the day's `resume.most_per_day` is not used up. A fault that",
-        "vented the mirror, a board fault other than its watchdog's trip, and the operator lock never resume",
+        "vented the mirror, a board fault other than its watchdog's trip, and a person's lock never resume",
         "automatically; one of them seen during a fault decides for the whole fault. `resume.faults` accepts only",
         "the names of faults that may resume.",
         "",

@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.web import access
-from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_user, known_users
+from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_user, known_users, on_behalf
 
 HOSTS = frozenset({"127.0.0.1", "localhost"})
 HOST = "127.0.0.1:7480"
@@ -126,6 +126,16 @@ async def test_names_and_passwords() -> None:
     assert "Secure" in headers["set-cookie"]
     assert (await site.ask(cookie=cookie_of(headers)))[0] == 200
     assert site.seen == [WebUser("anna", "operate")]
+
+
+def test_a_password_proves_an_account_and_a_link_does_not() -> None:
+    anna = Accounts({"anna": known_user("anna", "operate", "membrane!")}).by_password("anna", "membrane!")
+    assert anna is not None
+    assert on_behalf(anna, "page 1f")["account"] == "anna"
+    accounts = Accounts({})
+    visitor = accounts.by_link(accounts.secret)
+    assert visitor is not None
+    assert on_behalf(visitor, "page 1f")["account"] == ""
 
 
 def test_guessing_is_slowed_for_the_name_that_is_guessed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.events import LockSet
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import Progress
@@ -95,6 +96,31 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         await tab.until("document.body.innerText.includes('onerror')")
         assert await tab.value("document.title") == "membrane_ctrl"
         await tab.screenshot(tmp_path / "page.png")
+
+
+@needs_browser
+@pytest.mark.real_time
+async def test_a_viewer_sees_all_locks_and_types_the_word_of_one(tmp_path: Path) -> None:
+    press = "[...document.querySelectorAll('button')].find(b => b.innerText.trim().toLowerCase() === '{}').click()"
+    async with viewed(tmp_path) as (run, tab):
+        for number, author in enumerate(("unix:ann", "page:bob")):
+            word = f"bofa{number}"
+            run.tick((LockSet(word, "hands inside", author, author, "s", "2026-01-02T03:04:05+00:00", 1),))
+            await tab.until(
+                f"document.body.innerText.includes('hands inside') && document.body.innerText.includes('{word}')"
+            )
+        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Unlock')).click()")
+        await tab.until("document.querySelector('.q-dialog input')")
+        dialog = str(await tab.value("document.querySelector('.q-dialog').innerText"))
+        for part in ("unix:ann", "page:bob", "bofa0", "bofa1", "Type the word"):
+            assert part in dialog
+        assert await tab.value("document.querySelector('.q-dialog input').value") == "", "a person types the word"
+        await tab.press(*"bofa1")
+        await tab.value(press.format("do it"))
+        await tab.until("document.body.innerText.includes('unlock: done')")
+        (command,) = run.asked
+        assert (command.kind, command.text, command.who) == ("unlock", "bofa1", "page:link")
+        assert (command.account, command.from_person) == ("", True)
 
 
 STOP = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('STOP'))"

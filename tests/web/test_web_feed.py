@@ -13,8 +13,9 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.web.access import ACTIONS, STOP, WebUser, may, request
+from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
 from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.web.panels import alarms_of
 from tests.control_port.port_run import ROW, port_run
 
 _LOOK_S = 0.02
@@ -69,13 +70,32 @@ async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
 
 def test_every_action_is_one_that_the_port_reads() -> None:
     given = {"number": "3,5", "text": "why not", "": ""}
-    for action in (*ACTIONS, STOP):
+    for action in (*ACTIONS, UNLOCK, STOP):
         asked = request(action, "web: anna", given[action.asks])
         read = parse(encode({**asked, "number": 1}))
         assert read.do == action.do
         assert read.why == "web: anna"
-    offered = {action.do for action in (*ACTIONS, STOP)}
+    offered = {action.do for action in (*ACTIONS, UNLOCK, STOP)}
     assert set(TABLE) - offered == {"gains", "tune"}, "these take a file: they are not for a button"
+
+
+def test_what_the_page_states_of_a_viewer_is_read_by_the_port_and_a_link_is_no_account() -> None:
+    for has_login, account in ((True, "anna"), (False, "")):
+        user = WebUser("anna", "operate", has_login=has_login)
+        asked = {**request(UNLOCK, "web: anna", "bofak"), "on_behalf": on_behalf(user, "page 1f"), "number": 1}
+        read = parse(encode(asked))
+        assert read.text == "bofak"
+        assert read.on_behalf is not None
+        assert (read.on_behalf.account, read.on_behalf.role, read.on_behalf.via) == (account, "operate", "page")
+
+
+def test_locks_come_first_among_the_alarms() -> None:
+    lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
+    fault = {"code": 51, "name": "locked", "cause": "a lock", "remedy": "ask"}
+    shown = alarms_of({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault})
+    assert shown.startswith('LOCKED "hands inside" by unix:ann, 2026-01-02, word bofak; LOCKED')
+    assert "gumil" in shown
+    assert alarms_of({"locks": [], "fault": None}) == ""
 
 
 @pytest.mark.parametrize(

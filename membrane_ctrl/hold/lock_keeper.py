@@ -1,0 +1,178 @@
+"""Keeps the locks on disk in step with the controller. No tick waits for the disk; the answer to `lock` does.
+
+Another program may store a lock meanwhile (`safe` that does not find the hold): it becomes a command of a tick.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from membrane_ctrl.controller import tick
+from membrane_ctrl.controller.commands import AT_START, Command
+from membrane_ctrl.instruments.lock_store import LockStore, StoredLock
+from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model.errors import os_reason
+from membrane_ctrl.model.lock import Lock, distinct_word
+
+_LOOK_S = 1.0  # for locks that other programs store
+_RETRY_S = 10.0  # of a write that failed
+_OUTCOMES_MOST = 256  # remembered for the port, which asks at once
+
+
+@dataclass(frozen=True, slots=True)
+class LockStorage:
+    """Where a hold keeps its locks: the store, the keys of its devices, and the locks at the start."""
+
+    store: LockStore
+    devices: frozenset[str]
+    locks: tuple[StoredLock, ...] = ()
+
+
+class LockKeeper:
+    """Stores each new lock, removes the file of each removed one, and looks for locks that others store.
+
+    Parameters
+    ----------
+    storage : LockStorage or None
+        None: locks end with the run (the twin's default).
+    tell : callable
+        Records that storing failed, or works again.
+    ask : callable
+        Hands a command to the next tick.
+    """
+
+    def __init__(
+        self,
+        storage: LockStorage | None,
+        tell: Callable[[events.Event], None],
+        ask: Callable[[Command], None] = lambda command: None,
+    ) -> None:
+        self._storage, self._tell, self._ask = storage, tell, ask
+        # one thread, so that a lock and its removal stay in order
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="locks")
+        self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start
+        if storage is not None:
+            self._files = {each.lock.word: each.file for each in storage.locks}
+        self._failed: dict[str, Callable[[], None]] = {}  # by word: what to try again; of the disk thread
+        self._news: deque[events.Event] = deque()  # from the disk thread, as the next one
+        self._asked: deque[Command] = deque()
+        self._looking: Future[None] | None = None
+        self._outcomes: dict[int, Future[str]] = {}  # by number of the request
+        self._retry_at_s = time.monotonic() + _RETRY_S
+        self._look_at_s = time.monotonic() + _LOOK_S
+
+    @property
+    def at_start(self) -> tuple[Lock, ...]:
+        """Locks that are set when the run starts."""
+        return () if self._storage is None else tuple(each.lock for each in self._storage.locks)
+
+    def __enter__(self) -> LockKeeper:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._disk.submit(self._retry)
+        self._disk.shutdown()
+        self._report()
+
+    def heard(self, outputs: tick.TickOutputs) -> None:
+        """After a tick: store the locks that it set, and remove those that it removed.
+
+        Parameters
+        ----------
+        outputs : TickOutputs
+        """
+        if self._storage is None:
+            return
+        self._report()
+        for event in outputs.events:
+            match event:
+                case events.LockSet() if event.number or event.word not in self._files:
+                    act = partial(self._store_lock, self._storage, _lock_of(event))
+                    self._start(event.number, event.word, act)
+                case events.LockRemoved():
+                    act = partial(self._remove_file, self._storage, event.word)
+                    self._start(event.number, event.word, act)
+        if time.monotonic() >= self._retry_at_s:
+            self._retry_at_s = time.monotonic() + _RETRY_S
+            self._disk.submit(self._retry)
+        if time.monotonic() >= self._look_at_s and (self._looking is None or self._looking.done()):
+            self._look_at_s = time.monotonic() + _LOOK_S
+            self._looking = self._disk.submit(self._find_new, self._storage)
+
+    def outcome(self, number: int) -> Future[str] | None:
+        """Return the outcome of a request that set or removed a lock.
+
+        Parameters
+        ----------
+        number : int
+            Of the request.
+
+        Returns
+        -------
+        Future of str, or None
+            Why it is not on the disk; empty: it is. None if the request changed no lock, or locks are not stored.
+        """
+        return self._outcomes.pop(number, None)
+
+    def _start(self, number: int, word: str, act: Callable[[], None]) -> None:
+        future = self._disk.submit(self._try, word, act)
+        if number:
+            self._outcomes[number] = future
+            while len(self._outcomes) > _OUTCOMES_MOST:
+                del self._outcomes[next(iter(self._outcomes))]
+
+    def _store_lock(self, storage: LockStorage, lock: Lock) -> None:
+        self._files[lock.word] = storage.store.write_lock(lock, storage.devices)
+
+    def _remove_file(self, storage: LockStorage, word: str) -> None:
+        file = self._files.get(word)
+        if file is not None:
+            storage.store.remove_lock(file)
+        self._files.pop(word, None)
+
+    def _try(self, word: str, act: Callable[[], None]) -> str:
+        """Run an action of the disk thread; returns why it failed, or an empty text."""
+        try:
+            act()
+        except Exception as error:  # nothing else would see an exception of this thread
+            reason = f"{error.filename}: {os_reason(error)}" if isinstance(error, OSError) else str(error)
+            if word not in self._failed:
+                self._news.append(run_events.LockNotStored(word, reason))
+            self._failed[word] = act
+            return reason
+        if self._failed.pop(word, None) is not None:
+            self._news.append(run_events.LockStored(word))
+        return ""
+
+    def _find_new(self, storage: LockStorage) -> None:
+        """Ask for each lock on our devices that another program has stored.
+
+        What cannot be read is no lock here, as it is at the start: a disk that fails must not end a hold of weeks.
+        """
+        known = set(self._files.values())
+        for each in storage.store.find_locks(storage.devices):
+            if not each.devices or each.file in known:
+                continue
+            lock = replace(each.lock, word=distinct_word(each.lock.word, self._files))
+            self._files[lock.word] = each.file
+            self._asked.append(Command("latch", AT_START, text=lock.text, lock=lock))
+
+    def _retry(self) -> None:
+        for word, act in list(self._failed.items()):
+            self._try(word, act)
+
+    def _report(self) -> None:
+        while self._news:
+            self._tell(self._news.popleft())
+        while self._asked:
+            self._ask(self._asked.popleft())
+
+
+def _lock_of(event: events.LockSet) -> Lock:
+    return Lock(event.word, event.text, event.author, event.account, event.session, event.set_utc)
