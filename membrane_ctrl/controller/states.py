@@ -24,11 +24,16 @@ _STOP_GIVES_UP_S = 10.0
 
 
 def standby(scene: Scene) -> State:
-    """Keep the pump off until someone requests a hold."""
+    """Keep the pump off until someone requests a hold; an open interlock cancels the request."""
+    interlock = scene.interlocks.describe_open(scene.interlocks.last_mask)
+    if interlock:
+        scene.hold_wanted = False
     if scene.hold_wanted:
         scene.why = "a hold was requested"
         return State.CHECK
-    scene.why = f"standby: locked: {scene.latched}" if scene.latched else "standby: no hold was requested"
+    scene.why = f"standby: {interlock or 'no hold was requested'}"
+    if scene.latched:
+        scene.why = f"standby: locked: {scene.latched}"
     return State.STANDBY
 
 
@@ -337,7 +342,7 @@ def _missing(scene: Scene) -> str:
         return "no gauge pressure"
     if reading.latched_faults:
         return f"the board has latched faults {reading.latched_faults:#x}"
-    return ""
+    return scene.interlocks.describe_open(scene.interlocks.open_mask)
 
 
 def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:
