@@ -65,7 +65,7 @@ MESSAGE_BYTES = 512  # a slot of the ring: a tick takes 492; longer commands com
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
-    "foreign": "u1",
+    "foreign": "u1", "interlock_inputs": "i8",
 }  # fmt: skip
 _READING = tuple(field.name for field in fields(BenchReading))
 _LINK_UP, _HAS_READING = 1, 2
