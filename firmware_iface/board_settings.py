@@ -80,10 +80,10 @@ def _protection(table: Mapping[str, Any]) -> bytes:
     if not isinstance(fitted, bool):
         raise BoardSettingsError(f"gauge_fitted is {fitted!r}, expected true or false")
     timeout_ms = round(1000 * _number(table, "gauge_timeout_s", 0.1, 60.0, GAUGE_TIMEOUT_S))
-    frozen_ms = 0
-    if table.get("gauge_frozen_s") != 0:  # 0: not judged
-        frozen_ms = round(1000 * _number(table, "gauge_frozen_s", 1.0, 600.0, GAUGE_FROZEN_S))
-    return struct.pack(">4I", fitted, timeout_ms, frozen_ms, _interlock_mask(table))
+    frozen_s = _number(table, "gauge_frozen_s", 0.0, 600.0, GAUGE_FROZEN_S)
+    if 0.0 < frozen_s < 1.0:
+        raise BoardSettingsError(f"gauge_frozen_s is {frozen_s:g}, expected 0 or a number within 1..600")
+    return struct.pack(">4I", fitted, timeout_ms, round(1000 * frozen_s), _interlock_mask(table))
 
 
 def _interlock_mask(table: Mapping[str, Any]) -> int:

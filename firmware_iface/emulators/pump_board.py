@@ -122,10 +122,10 @@ class BoardState:
         passed_s = now_s - self._now_s
         self._now_s = now_s
         self._sample = sample
-        self._watch_gauge(passed_s)
-        self._protect()
         if sample.gauge_pressure_pa > GAUGE_PRESSURE_LIMIT_PA:
             self._latch(self._over_pressure_mask)
+        self._watch_gauge(passed_s)
+        self._protect()
         if self._settable["watchdog_arm"] and now_s - self._fed_s > self._settable["watchdog_period_s"]:
             self._latch(self._watchdog_mask)
 
