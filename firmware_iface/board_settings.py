@@ -19,8 +19,14 @@ CHANNELS = ("displacement_um", "gauge_pressure_pa", "ambient_pressure_pa", "air_
 _MAGIC = 0x4D425331
 _PARITIES = ("N", "E", "O")
 _I32_MAX = 2**31 - 1
-_KEYS = {"unit_id", "baud", "parity", "silence_us", "pressure_limit_pa", "pump_limit_fraction", "channel"}
+_KEYS = {
+    "unit_id", "baud", "parity", "silence_us", "pressure_limit_pa", "pump_limit_fraction", "channel", "gauge_fitted",
+    "gauge_timeout_s", "gauge_frozen_s", "interlocks_fitted",
+}  # fmt: skip
 _CHANNEL_KEYS = {"points", "plausible_raw"}
+_INTERLOCK_INPUTS = 16
+# as settings.h has them for records that do not state them
+GAUGE_TIMEOUT_S, GAUGE_FROZEN_S = 15.0, 60.0
 _FAST_BAUD, _FAST_SILENCE_US, _SILENCE_BITS = 19_200, 1750, 38.5  # 3.5 characters of 11 bits
 
 
@@ -35,6 +41,9 @@ def record(table: Mapping[str, Any]) -> bytes:
     standard's), `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value],
     [raw, value]], in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). An
     omitted channel arrives in counts of its register.
+
+    `gauge_fitted` (true) with `gauge_timeout_s` (15) and `gauge_frozen_s` (60; 0: not judged) state how the board
+    guards its pump against a lost gauge; `interlocks_fitted` lists the interlock inputs in use, from 0 (none).
 
     Raises BoardSettingsError (an unknown or missing key, or a value outside what the board takes).
     """
@@ -56,12 +65,37 @@ def record(table: Mapping[str, Any]) -> bytes:
         round(50_000 * _number(table, "pump_limit_fraction", 0.00002, 1.0)),
     )
     body += b"".join(_scale(name, channels.get(name, {})) for name in CHANNELS)
+    body += _protection(table)
     head = struct.pack(">2I", _MAGIC, 8 + len(body) + 4)
     return head + body + struct.pack(">I", zlib.crc32(head + body))
 
 
 def _standard_silence_us(baud: int) -> int:
     return _FAST_SILENCE_US if baud > _FAST_BAUD else -int(-_SILENCE_BITS * 1e6 // baud)
+
+
+def _protection(table: Mapping[str, Any]) -> bytes:
+    """Pack which protections are fitted, and the times of the gauge's guard in ms."""
+    fitted = table.get("gauge_fitted", True)
+    if not isinstance(fitted, bool):
+        raise BoardSettingsError(f"gauge_fitted is {fitted!r}, expected true or false")
+    timeout_ms = round(1000 * _number(table, "gauge_timeout_s", 0.1, 60.0, GAUGE_TIMEOUT_S))
+    frozen_s = _number(table, "gauge_frozen_s", 0.0, 600.0, GAUGE_FROZEN_S)
+    if 0.0 < frozen_s < 1.0:
+        raise BoardSettingsError(f"gauge_frozen_s is {frozen_s:g}, expected 0 or a number within 1..600")
+    return struct.pack(">4I", fitted, timeout_ms, round(1000 * frozen_s), _interlock_mask(table))
+
+
+def _interlock_mask(table: Mapping[str, Any]) -> int:
+    """Return the mask of the fitted interlock inputs, which the file lists by number."""
+    inputs = table.get("interlocks_fitted", [])
+    known = range(_INTERLOCK_INPUTS)
+    numbers = isinstance(inputs, list) and all(type(number) is int and number in known for number in inputs)
+    if not numbers or len(set(inputs)) < len(inputs):
+        raise BoardSettingsError(
+            f"interlocks_fitted is {inputs!r}, expected a list of different inputs, 0..{_INTERLOCK_INPUTS - 1}"
+        )
+    return sum(1 << number for number in inputs)
 
 
 def _scale(name: str, table: Mapping[str, Any]) -> bytes:
@@ -94,8 +128,8 @@ def _whole(table: Mapping[str, Any], key: str, least: int, most: int, default: i
     return value
 
 
-def _number(table: Mapping[str, Any], key: str, least: float, most: float) -> float:
-    value = table.get(key)
+def _number(table: Mapping[str, Any], key: str, least: float, most: float, default: float | None = None) -> float:
+    value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
         raise BoardSettingsError(f"{key} is {value!r}, expected a number within {least:g}..{most:g}")
     return float(value)

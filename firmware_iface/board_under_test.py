@@ -33,12 +33,20 @@ class BoardUnderTest:
         self._registers: register_map.RegisterMap = (
             register_map.default_map()
         )  # of the board, once it has said its version
+        # its own protections, from map version 3 on
+        self._gauge_fitted = False
+        self._gauge_timeout_s = 0.0
+        self._interlocks_fitted = 0
         self._heartbeat = 0
         self._id, self._key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
 
     @property
     def _claims(self) -> bool:
         return self._registers.map_version >= 2
+
+    @property
+    def _guards(self) -> bool:
+        return self._registers.map_version >= 3
 
     async def _read(self, block: register_map.Block) -> dict[str, float]:
         return block.decode(await self._link.read_holding(block.address, block.count))

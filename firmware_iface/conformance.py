@@ -16,6 +16,8 @@ from firmware_iface.links.modbus_rtu import ModbusLinks
 
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
+_FEED_S = 0.2  # between two commands where a check keeps the pump commanded for long
+_UNDISTURBED_S = 1.0
 
 _Check = tuple[str, str, Callable[[], Awaitable[None]]]  # its name, the section of docs/firmware.md, the check
 
@@ -43,10 +45,31 @@ class Conformance(board_under_test.BoardUnderTest):
         with contextlib.suppress(roles.DeviceRefusedError):  # the check of the watchdog reports a failure to arm it
             await self._arm(REST_S)
         await self._rest()
-        for check, section, test in self._checks():
+        checks, not_run = await self._possible_checks()
+        for check, section, test in checks:
             findings.append(await self._made(check, section, partial(self._armed, test)))
             await self._rest()
+        if not_run:
+            findings.append(CheckResult("all other requirements", "The conformance test", f"not run: {not_run}"))
         return findings
+
+    async def _possible_checks(self) -> tuple[list[_Check], str]:
+        """Return the checks that the board's inputs allow now, and why the others cannot be run.
+
+        An open interlock or a missing gauge keeps the pump off, so that only the board's reaction to it is tested.
+        """
+        if not self._guards:
+            return self._checks(), ""
+        sensors = await self._sensors()
+        open_inputs = self._interlocks_fitted & ~int(sensors["interlock_inputs"])
+        if open_inputs:
+            return (
+                self._interlock_checks(),
+                f"interlock inputs {open_inputs:#x} are open; close them and run it again",
+            )
+        if self._gauge_fitted and math.isnan(sensors["gauge_pressure_pa"]):
+            return self._gauge_checks(), "the fitted gauge has no value; connect it and run it again"
+        return self._checks(), ""
 
     async def _armed(self, test: Callable[[], Awaitable[None]]) -> None:
         await self._arm(REST_S)
@@ -82,8 +105,7 @@ class Conformance(board_under_test.BoardUnderTest):
         ]
         if not self._claims:
             return checks
-        return [
-            *checks,
+        checks += [
             ("the claim and the period are shown, the key is not", "Claim", self._shown),
             ("another claim is refused", "Claim", self._second),
             ("nobody else commands, clears or disarms", "Claim", self._strangers),
@@ -92,18 +114,47 @@ class Conformance(board_under_test.BoardUnderTest):
             ("without a claim nothing is commanded", "Claim", self._unclaimed),
             ("anybody may stop the pump", "Stop", self._stopped),
         ]
+        if self._guards:
+            checks.append(("a gauge with a value and closed interlocks let the pump run", "Gauge", self._undisturbed))
+        return checks
+
+    def _gauge_checks(self) -> list[_Check]:
+        return [
+            ("every block is read whole", "Registers", self._blocks),
+            ("without a gauge the pump is off after the time-out", "Gauge", self._without_gauge),
+            ("clearing does not run the pump without a gauge", "Gauge", self._cleared_without_gauge),
+        ]
+
+    def _interlock_checks(self) -> list[_Check]:
+        return [
+            ("every block is read whole", "Registers", self._blocks),
+            ("an open interlock keeps the pump off", "Interlocks", self._open_interlock),
+            ("clearing does not run the pump with an open interlock", "Interlocks", self._cleared_interlock),
+        ]
 
     async def _identity(self) -> None:
-        found = await self._read(self._registers.block("identity"))
-        kind, version = int(found["device_kind"]), int(found["map_version"])
+        # these two never move; the other registers follow from them
+        kind, version = await self._link.read_holding(self._registers.block("identity").address, 2)
         wanted = self._registers.device_kind
         require(kind == wanted, f"device kind is {kind}, expected {wanted}")
-        known = " and ".join(str(known) for known in register_map.known_maps())
+        known = ", ".join(str(known) for known in register_map.known_maps())
         require(version in register_map.known_maps(), f"map version is {version}, this test knows {known}")
         self._registers = register_map.known_maps()[version]
+        found = await self._read(self._registers.block("identity"))
         require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
         require(0 < found["pump_limit_fraction"] <= 1, "pump_limit_fraction is not within 0..1")
+        if self._guards:
+            self._note_protections(found)
         self._heartbeat = int((await self._sensors())["heartbeat_echo"])
+
+    def _note_protections(self, identity: dict[str, float]) -> None:
+        """Take over which protections are fitted, and check that their times are possible."""
+        fitted, timeout_s, frozen_s = (identity[f"gauge_{name}"] for name in ("fitted", "timeout_s", "frozen_s"))
+        require(fitted in (0, 1), f"gauge_fitted is {fitted:g}, expected 0 or 1")
+        require(0.1 <= timeout_s <= 60, f"gauge_timeout_s is {timeout_s:g}, expected 0.1..60")
+        require(frozen_s == 0 or 1 <= frozen_s <= 600, f"gauge_frozen_s is {frozen_s:g}, expected 0 or 1..600")
+        self._gauge_fitted, self._gauge_timeout_s = fitted == 1, timeout_s
+        self._interlocks_fitted = int(identity["interlocks_fitted"])
 
     async def _blocks(self) -> None:
         for block in self._registers.blocks:
@@ -296,6 +347,49 @@ class Conformance(board_under_test.BoardUnderTest):
         require(value == 0, f"runs the pump at {value:g} after stop")
         require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, "moves the vent at stop")
         require(bool(int(found["latched_faults"]) & mask), "does not latch the fault `stopped`")
+
+    async def _undisturbed(self) -> None:
+        await self._write_for(_UNDISTURBED_S, PUMP_FRACTION)
+        found = await self._sensors()
+        latched = int(found["latched_faults"])
+        require(not latched, f"latches the faults {latched:#x} without a cause")
+        require(found["pump_readback_fraction"] > 0, "stops the pump without a cause")
+
+    async def _without_gauge(self) -> None:
+        await self._write_for(self._gauge_timeout_s + _GRACE_S, PUMP_FRACTION, 0.25)
+        await self._kept_off("gauge_lost", f"{self._gauge_timeout_s:g} s without a gauge")
+
+    async def _cleared_without_gauge(self) -> None:
+        """By now the gauge has been missing for longer than its time-out."""
+        for when in ("a command without a gauge", "clearing without a gauge"):
+            await self._write_for(_GRACE_S, PUMP_FRACTION, 0.25)
+            await self._kept_off("gauge_lost", when)
+            await self._clear()
+
+    async def _open_interlock(self) -> None:
+        await self._write_for(_GRACE_S, PUMP_FRACTION, 0.25)
+        await self._kept_off("interlock", "a command with an open interlock")
+
+    async def _cleared_interlock(self) -> None:
+        await self._clear()
+        await self._write_for(_GRACE_S, PUMP_FRACTION, 0.25)
+        await self._kept_off("interlock", "clearing with an open interlock")
+
+    async def _write_for(self, duration_s: float, pump: float, vent: float = 0.0) -> None:
+        """Keep commanding the outputs for a time, and feed the watchdog."""
+        steps = math.ceil(duration_s / _FEED_S)
+        for _ in range(steps):
+            await self._write(pump, vent)
+            await self._sleep(duration_s / steps)
+
+    async def _kept_off(self, fault: str, after: str) -> None:
+        """Require that this fault is latched, the pump off and the vent where it was commanded."""
+        found = await self._sensors()
+        value = found["pump_readback_fraction"]
+        require(value == 0, f"runs the pump at {value:g} after {after}")
+        latched = int(found["latched_faults"]) & self._registers.fault_mask(fault)
+        require(bool(latched), f"does not latch the fault `{fault}` after {after}")
+        require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, f"moves the vent after {after}")
 
 
 def _time_s(values: dict[str, float]) -> float:

@@ -3,23 +3,29 @@
 #ifndef MEMBRANE_BOARD_H
 #define MEMBRANE_BOARD_H
 
-#define MEMBRANE_MAP_VERSION 2u
+#define MEMBRANE_MAP_VERSION 3u
 #define MEMBRANE_DEVICE_KIND 0x4D42u
 #define MEMBRANE_I32_NO_VALUE (-2147483647 - 1) /* there is no value */
 
 /* identity (ro): Identity, and the limits that the board itself enforces. */
 #define MEMBRANE_BLOCK_IDENTITY_ADDRESS 0u
-#define MEMBRANE_BLOCK_IDENTITY_WORDS 7u
+#define MEMBRANE_BLOCK_IDENTITY_WORDS 11u
 #define MEMBRANE_DEVICE_KIND_ADDRESS 0u /* u16: 19778 (0x4D42): a membrane pump board */
 #define MEMBRANE_MAP_VERSION_ADDRESS 1u /* u16: version of this map; a controller refuses one it does not know */
 #define MEMBRANE_FIRMWARE_VERSION_ADDRESS 2u /* u32: major * 65536 + minor * 256 + patch */
 #define MEMBRANE_GAUGE_PRESSURE_LIMIT_PA_ADDRESS 4u /* f32: above it the board itself stops the pump and opens the vent */
 #define MEMBRANE_PUMP_LIMIT_FRACTION_ADDRESS 6u /* u16: highest drive that the board gives to the pump, whatever the command */
 #define MEMBRANE_PUMP_LIMIT_FRACTION_COUNTS_PER_UNIT 50000
+#define MEMBRANE_GAUGE_FITTED_ADDRESS 7u /* u16: 1: the board requires its gauge; 0: no gauge is fitted, and the board has no over-pressure protection */
+#define MEMBRANE_GAUGE_TIMEOUT_S_ADDRESS 8u /* u16: longest time that the pump runs without a value of the fitted gauge */
+#define MEMBRANE_GAUGE_TIMEOUT_S_COUNTS_PER_UNIT 1000
+#define MEMBRANE_GAUGE_FROZEN_S_ADDRESS 9u /* u16: longest time of pumping during which the fitted gauge may repeat one value; 0: not judged */
+#define MEMBRANE_GAUGE_FROZEN_S_COUNTS_PER_UNIT 100
+#define MEMBRANE_INTERLOCKS_FITTED_ADDRESS 10u /* u16: bit i: interlock input i is fitted, and the board stops the pump when its circuit opens */
 
 /* sensors (ro): One consistent sample and the state of the board: read it whole, once a tick. */
 #define MEMBRANE_BLOCK_SENSORS_ADDRESS 16u
-#define MEMBRANE_BLOCK_SENSORS_WORDS 25u
+#define MEMBRANE_BLOCK_SENSORS_WORDS 26u
 #define MEMBRANE_SAMPLE_COUNTER_ADDRESS 16u /* u32: counts samples, wraps; a constant value means a frozen board */
 #define MEMBRANE_DEVICE_TIME_S_ADDRESS 18u /* u32: whole seconds since power-up at the sample */
 #define MEMBRANE_DEVICE_TIME_FRACTION_S_ADDRESS 20u /* u16: fraction of a second to add to device_time_s */
@@ -46,6 +52,7 @@
 #define MEMBRANE_PERIOD_IN_FORCE_S_ADDRESS 38u /* u16: watchdog period now */
 #define MEMBRANE_PERIOD_IN_FORCE_S_COUNTS_PER_UNIT 1000
 #define MEMBRANE_CLAIM_IN_FORCE_ADDRESS 39u /* u32: claim_id of the present or last holder of the board; 0: none */
+#define MEMBRANE_INTERLOCK_INPUTS_ADDRESS 41u /* u16: bit i: the circuit of interlock input i is closed at the sample; a cut wire is open */
 
 /* settings (rw): Lost at power-down. From map version 2 on, arming claims the board; written whole or not at all. */
 #define MEMBRANE_BLOCK_SETTINGS_ADDRESS 48u
@@ -103,5 +110,7 @@
 #define MEMBRANE_FAULT_WATCHDOG 0x0001u /* no write of the whole command block with a new heartbeat within the period: pump off, vent as it was */
 #define MEMBRANE_FAULT_OVER_PRESSURE 0x0002u /* gauge pressure above gauge_pressure_limit_pa: pump off, vent open */
 #define MEMBRANE_FAULT_STOPPED 0x0004u /* a program wrote `stop`: pump off, vent as it was */
+#define MEMBRANE_FAULT_GAUGE_LOST 0x0008u /* a pump command above 0 while the fitted gauge has had no value for gauge_timeout_s, or has repeated its value for gauge_frozen_s of pumping: pump off, vent as it was */
+#define MEMBRANE_FAULT_INTERLOCK 0x0010u /* the circuit of a fitted interlock input is open: pump off, vent as it was */
 
 #endif

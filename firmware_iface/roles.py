@@ -71,6 +71,7 @@ class BenchReading:
     watchdog_tripped: bool
     latched_faults: int
     foreign: int = 0
+    interlock_inputs: int = 0  # bit i: the board's interlock input i is closed; 0 without inputs: all open
     interlocks_open: int = 0
 
 
@@ -94,6 +95,9 @@ class BenchIdentity:
     pump_limit_fraction: float = 1.0
     displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # range of the sensor
     gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
+    gauge_fitted: bool = True  # False: the board has no gauge, and so no over-pressure protection
+    gauge_timeout_s: float = math.inf  # the board itself stops the pump this long after its gauge fails
+    interlocks_fitted: int = 0  # bit i: the board itself stops the pump when interlock input i opens
 
 
 class Bench(Protocol):

@@ -15,6 +15,7 @@ NO_CLAIM = (
     "this board has no claim (register map 1): any program that reaches it can run its pump, and two programs on two "
     "machines are not kept apart; update its firmware"
 )
+NO_GAUGE_GUARD = "this board's firmware does not stop the pump when its gauge fails"
 _HEARTBEATS = 2**16
 _U32_MAX = 2**32 - 1
 # refused writes in a row until a claim counts as lost although its name is still there: one may be a gateway's answer
@@ -29,7 +30,8 @@ class PumpBoard:
     then the board keeps the pump off.
 
     `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 has no claim and obeys every program.
+    takes commands from nobody else. A board of map version 1 has no claim and obeys every program. Boards before map
+    version 3 do not stop the pump when their gauge fails, and have no interlock inputs: readings show none closed.
 
     The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is `tcp://HOST:PORT` (502 when left
     out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link` replaces it. Raises ValueError (an invalid URL, or a
@@ -98,13 +100,13 @@ class PumpBoard:
                 f"{self._link.name}: device kind {kind} is not a {_KIND} ({register_map.default_map().device_kind})"
             )
         if version not in register_map.known_maps():
-            known = " and ".join(str(known) for known in register_map.known_maps())
+            known = ", ".join(str(known) for known in register_map.known_maps())
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: register map version {version}, this program knows {known}; "
                 "update the firmware or the program"
             )
         self._registers = register_map.known_maps()[version]
-        found = await self._read(identity)
+        found = await self._read(self._registers.block("identity"))
         firmware = int(found["firmware_version"])
         return roles.BenchIdentity(
             _KIND,
@@ -113,6 +115,10 @@ class PumpBoard:
             math.nan,
             found["gauge_pressure_limit_pa"],
             found["pump_limit_fraction"],
+            # registers of map version 3
+            gauge_fitted=found.get("gauge_fitted", 1.0) != 0.0,
+            gauge_timeout_s=found.get("gauge_timeout_s", math.inf),
+            interlocks_fitted=int(found.get("interlocks_fitted", 0)),
         )
 
     async def _arm(self) -> None:
@@ -168,6 +174,7 @@ class PumpBoard:
             watchdog_tripped=bool(values["watchdog_tripped"]),
             latched_faults=int(values["latched_faults"]),
             foreign=self._foreign(values) if self._armed else 0,
+            interlock_inputs=int(values.get("interlock_inputs", 0)),
         )
 
     def _foreign(self, sensors: Mapping[str, float]) -> int:

@@ -4,19 +4,22 @@
 """
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from firmware_iface.board_settings import GAUGE_FROZEN_S, GAUGE_TIMEOUT_S
 from firmware_iface.emulators import modbus_server
 from firmware_iface.emulators.modbus_server import BUSY, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
 from firmware_iface.register_map import Block, Register, RegisterMap, default_map, make_block
 
-FIRMWARE_VERSION = 0x00_01_00_00  # 1.0.0
+FIRMWARE_VERSION = 0x00_01_01_00  # 1.1.0
 # the paper's mirror works at 600 Pa; the controller's own limit (750 Pa) is to act first
 GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
+_GAUGE_RANGE_PA = default_map().register("gauge_pressure_pa").to_value(2**31 - 1)
 _SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # registers that read as 0
 # the register of a block that carries the claim's secret; a block without one needs no claim
 _KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
@@ -34,18 +37,37 @@ class BoardSample:
     gas_temperature_c: float
     sample_counter: int
     device_time_s: float
+    interlock_inputs: int = 0xFFFF  # bit i: the circuit of interlock input i is closed
+
+    @property
+    def gauge_present(self) -> bool:
+        """Whether the gauge has a value that its register can hold."""
+        return abs(self.gauge_pressure_pa) <= _GAUGE_RANGE_PA  # False for NaN
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSettings:
+    """Settings that a board keeps without power: which protections of its own are fitted (from map version 3)."""
+
+    gauge_fitted: bool = True
+    gauge_timeout_s: float = GAUGE_TIMEOUT_S  # of pumping without a value of the gauge
+    gauge_frozen_s: float = GAUGE_FROZEN_S  # of pumping with a gauge that repeats its value; 0: not judged
+    interlocks_fitted: int = 0  # bit i: interlock input i stops the pump when it is open
 
 
 class BoardState:
     """The board between two requests, of the map version of `registers`; it reports `map_version`.
 
-    `advance` is called before every request and every few milliseconds: the watchdog and the pressure limit depend
-    only on the time passed in.
+    `advance` is called before every request and every few milliseconds: the watchdog, the pressure limit and the
+    guard of the gauge depend only on the time passed in. Boards of map versions 1 and 2 ignore `stored`.
     """
 
-    def __init__(self, registers: RegisterMap, sample: BoardSample) -> None:
+    def __init__(
+        self, registers: RegisterMap, sample: BoardSample, stored: StoredSettings = StoredSettings()
+    ) -> None:
         self.map_version = registers.map_version
         self.registers = registers
+        self.stored = stored
         self._by_address = {register.address: register for register in registers}
         # drivers read whole blocks again and again: found at once
         self._by_span = {(block.address, block.count): block for block in registers.blocks}
@@ -54,6 +76,9 @@ class BoardState:
         self._watchdog_mask = registers.fault_mask("watchdog")
         self._over_pressure_mask = registers.fault_mask("over_pressure")
         self._stopped_mask = registers.fault_mask("stopped") if self._claims else 0
+        self._guards = registers.map_version >= 3
+        self._gauge_lost_mask = registers.fault_mask("gauge_lost") if self._guards else 0
+        self._interlock_mask = registers.fault_mask("interlock") if self._guards else 0
         self._sample = sample
         self._now_s = 0.0
         self.restart()
@@ -72,6 +97,11 @@ class BoardState:
         self._heartbeat_fed = 0.0
         self._fed_s = 0.0
         self._faults = 0
+        self._gauge_seen_s = -math.inf  # when the gauge last had a value
+        self._gauge_pa = math.nan  # that value
+        self._gauge_same_s = 0.0  # time of pumping since it changed, or since a person cleared `gauge_lost`
+        self._watch_gauge(0.0)
+        self._protect()
 
     @property
     def pump_fraction(self) -> float:
@@ -88,13 +118,48 @@ class BoardState:
         return 1.0 if self._faults & self._over_pressure_mask else self._settable["vent_command_fraction"]
 
     def advance(self, now_s: float, sample: BoardSample) -> None:
-        """Take the newest sample at a time (on any axis), then let the pressure limit and the watchdog act."""
+        """Take the newest sample at a time (on any axis), then let the board's own protections act."""
+        passed_s = now_s - self._now_s
         self._now_s = now_s
         self._sample = sample
         if sample.gauge_pressure_pa > GAUGE_PRESSURE_LIMIT_PA:
             self._latch(self._over_pressure_mask)
+        self._watch_gauge(passed_s)
+        self._protect()
         if self._settable["watchdog_arm"] and now_s - self._fed_s > self._settable["watchdog_period_s"]:
             self._latch(self._watchdog_mask)
+
+    def _watch_gauge(self, passed_s: float) -> None:
+        """Note when the gauge had a value, and for how long of pumping it has repeated it."""
+        if self.pump_fraction > 0:
+            self._gauge_same_s += passed_s
+        if not self._sample.gauge_present:
+            return
+        self._gauge_seen_s = self._now_s
+        if self._sample.gauge_pressure_pa != self._gauge_pa:
+            self._gauge_pa = self._sample.gauge_pressure_pa
+            self._gauge_same_s = 0.0
+
+    @property
+    def _gauge_lost(self) -> bool:
+        stored = self.stored
+        missing = self._now_s - self._gauge_seen_s > stored.gauge_timeout_s
+        frozen = 0 < stored.gauge_frozen_s < self._gauge_same_s
+        return stored.gauge_fitted and (missing or frozen)
+
+    def _protect(self) -> None:
+        """Stop a pump whose gauge is lost, and latch an open interlock.
+
+        Judged with every sample and after every write, so that no command drives the pump even for a moment. The
+        gauge's age goes on while the fault is latched and when it is cleared: without a new value the pump does not
+        run again. An open circuit latches even if the pump is off: an emergency stop must not be forgotten.
+        """
+        if not self._guards:
+            return
+        if self._settable["pump_command_fraction"] > 0 and self._gauge_lost:
+            self._latch(self._gauge_lost_mask)
+        if self.stored.interlocks_fitted & ~self._sample.interlock_inputs:
+            self._latch(self._interlock_mask)
 
     @property
     def held(self) -> bool:
@@ -192,6 +257,9 @@ class BoardState:
             self._latch(self._stopped_mask)
         if arms or feeds or cleared & self._watchdog_mask:
             self._fed_s = self._now_s
+        if cleared & self._gauge_lost_mask:
+            self._gauge_same_s = 0.0  # a gauge at rest shows that it works only once the pump runs
+        self._protect()
 
     def _values(self) -> dict[str, float]:
         sample = self._sample
@@ -203,13 +271,17 @@ class BoardState:
             "firmware_version": FIRMWARE_VERSION,
             "gauge_pressure_limit_pa": GAUGE_PRESSURE_LIMIT_PA,
             "pump_limit_fraction": PUMP_LIMIT_FRACTION,
+            "gauge_fitted": float(self.stored.gauge_fitted),
+            "gauge_timeout_s": self.stored.gauge_timeout_s,
+            "gauge_frozen_s": self.stored.gauge_frozen_s,
+            "interlocks_fitted": self.stored.interlocks_fitted,
             "sample_counter": sample.sample_counter % 2**32,
             "device_time_s": whole_s,
             # cut, not rounded: 10000 of 10000 would be a second too many
             "device_time_fraction_s": int((sample.device_time_s - whole_s) * 10_000) / 10_000,
             "displacement_quality": sample.displacement_quality,
             "displacement_um": sample.displacement_um,
-            "gauge_pressure_pa": sample.gauge_pressure_pa,
+            "gauge_pressure_pa": sample.gauge_pressure_pa if sample.gauge_present else math.nan,
             "ambient_pressure_pa": sample.ambient_pressure_pa,
             "air_temperature_c": sample.air_temperature_c,
             "gas_temperature_c": sample.gas_temperature_c,
@@ -221,6 +293,7 @@ class BoardState:
             "latched_faults": self._faults,
             "period_in_force_s": self._settable["watchdog_period_s"],
             "claim_in_force": self._claim_id,
+            "interlock_inputs": sample.interlock_inputs & 0xFFFF,
             "claim_id": self._claim_id,
             **_SECRETS,
         }
@@ -244,7 +317,8 @@ class PumpBoardEmulator:
     """Serves `plant` on Modbus TCP, from the event loop's thread.
 
     Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default the event loop's.
-    Requests to other units get exception 11, as from a gateway. `registers` may be those of an earlier map version.
+    Requests to other units get exception 11, as from a gateway. `registers` may be those of an earlier map version;
+    `stored` are the settings that the board keeps without power.
     """
 
     def __init__(
@@ -255,12 +329,13 @@ class PumpBoardEmulator:
         clock: Callable[[], float] | None = None,
         unit_id: int = 1,
         registers: RegisterMap | None = None,
+        stored: StoredSettings = StoredSettings(),
     ) -> None:
         self._plant = plant
         self._clock = clock or (lambda: asyncio.get_running_loop().time())
         self._unit_id = unit_id
         self._sample = plant.sample()
-        self.state = BoardState(registers or default_map(), self._sample)
+        self.state = BoardState(registers or default_map(), self._sample, stored)
         self._actuated = (0.0, 0.0)
         self._server = modbus_server.ModbusTcpServer(self._handle, host, port)
         self._task: asyncio.Task[None] | None = None

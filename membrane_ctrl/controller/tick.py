@@ -61,11 +61,11 @@ class TickOutputs:
 
 # First bytes of the inputs ring's messages.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
-MESSAGE_BYTES = 640  # a slot of the ring: a tick takes some 510; longer commands come in pieces
+MESSAGE_BYTES = 640  # a slot of the ring: a tick takes some 520; longer commands come in pieces
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
-    "foreign": "u1", "interlocks_open": "i8",
+    "foreign": "u1", "interlock_inputs": "i8", "interlocks_open": "i8",
 }  # fmt: skip
 _READING = tuple(field.name for field in fields(BenchReading))
 _LINK_UP, _HAS_READING = 1, 2

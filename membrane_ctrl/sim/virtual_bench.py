@@ -33,6 +33,7 @@ class Wrong:
     thermometer_lost: bool = False
     gauge_offset_pa: float = 0.0  # the gauge reads this much too much
     gauge_stuck: bool = False  # it repeats its value
+    open_interlocks: int = 0  # bit i: the circuit of the board's interlock input i is open
     silent: bool = False  # requests are carried out and not answered
     unreachable: bool = False  # there is no connection
     lost_every: int = 0  # every n-th request gets no answer; 0: none is lost
@@ -50,14 +51,19 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    `wrong` are its switches, `truth` is the true state when the board last took its sample, or would have.
+    `stored` are the settings that the board keeps without power. `wrong` are its switches, `truth` is the true state
+    when the board last took its sample, or would have.
     """
 
-    def __init__(self, plant: Plant, watchdog_s: float = 0.5) -> None:
+    def __init__(
+        self, plant: Plant, watchdog_s: float = 0.5, stored: pump_board.StoredSettings | None = None
+    ) -> None:
         self.plant = plant
         self.wrong = Wrong()
         self._sample = self._sampled(None)
-        self.board = pump_board.BoardState(register_map.default_map(), self._sample)
+        self.board = pump_board.BoardState(
+            register_map.default_map(), self._sample, stored or pump_board.StoredSettings()
+        )
         self._driver = PumpBoard("", watchdog_s=watchdog_s, link=MemoryLink(self))
 
     def advance(self, duration_s: float) -> None:
@@ -123,6 +129,7 @@ class VirtualBench:
             gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
+            interlock_inputs=sample.interlock_inputs & ~int(wrong.open_interlocks),
         )
 
 

@@ -73,7 +73,7 @@ def sample_line(plant: BoardPlant) -> str:
     sample = plant.sample()
     registers = default_map()
     counts = [_counts(getattr(sample, name), registers.register(name).counts_per_unit) for name in CHANNELS]
-    return f"I {' '.join(map(str, counts))} {sample.displacement_quality}\n"
+    return f"I {' '.join(map(str, counts))} {sample.displacement_quality} {sample.interlock_inputs}\n"
 
 
 def _counts(value: float, counts_per_unit: int) -> int:

@@ -19,16 +19,46 @@ from firmware_iface.roles import BenchCommand
 from tests.board.build_board import built
 from tests.board.film_wire import FilmWire
 from tests.board.still_film import StillFilm
-from tests.board.virtual_board import SETTINGS, VirtualBoard, VirtualLink
+from tests.board.virtual_board import AT_REST, NO_VALUE, SETTINGS, VirtualBoard, VirtualLink
 
-_FINDINGS = 21
+_FINDINGS = 22
 
 
 async def test_the_firmware_conforms(virtual_board: VirtualBoard) -> None:
+    virtual_board.set_inputs(AT_REST)
     link = VirtualLink(virtual_board)
     findings = await Conformance(link, link.sleep).run()
     assert [(found.check, found.problem) for found in findings if found.problem] == []
     assert len(findings) == _FINDINGS
+
+
+async def test_the_firmware_s_guard_of_its_gauge_conforms(firmware_library: Path) -> None:
+    board = VirtualBoard(firmware_library, {**SETTINGS, "gauge_timeout_s": 2.5})
+    board.set_inputs([AT_REST[0], NO_VALUE, *AT_REST[2:]])
+    link = VirtualLink(board)
+    findings = await Conformance(link, link.sleep).run()
+    assert {found.check: found.problem[:40] for found in findings if found.problem} == {
+        "all other requirements": "not run: the fitted gauge has no value; "
+    }
+    assert [found.section for found in findings] == [
+        "Registers",
+        "Registers",
+        "Gauge",
+        "Gauge",
+        "The conformance test",
+    ]
+
+
+async def test_the_firmware_s_interlocks_conform(firmware_library: Path) -> None:
+    board = VirtualBoard(firmware_library, {**SETTINGS, "interlocks_fitted": [0, 3]})
+    board.set_inputs(AT_REST)
+    board.set_interlocks(0b0111)
+    link = VirtualLink(board)
+    findings = await Conformance(link, link.sleep).run()
+    assert {found.check: found.problem[:40] for found in findings if found.problem} == {
+        "all other requirements": "not run: interlock inputs 0x8 are open; "
+    }
+    assert [found.section for found in findings][1:-1] == ["Registers", "Interlocks", "Interlocks"]
 
 
 @pytest.fixture(scope="session")

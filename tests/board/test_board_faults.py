@@ -253,7 +253,7 @@ def test_a_line_cut_within_a_request_stops_the_pump_after_the_period(virtual_boa
 
 def test_a_frame_is_one_only_between_silences(virtual_board: VirtualBoard) -> None:
     ask = rtu_frame(1, struct.pack(">BHH", 3, 0, 2))
-    answer = rtu_frame(1, bytes.fromhex("03044d420002"))
+    answer = rtu_frame(1, bytes.fromhex("03044d420003"))
     assert virtual_board.ask_frame(ask) == answer
     assert virtual_board.ask_frame(b"\0" + ask) == b""  # noise right before it
     assert virtual_board.ask_frame(ask + ask) == b""
@@ -280,7 +280,7 @@ def test_a_line_that_tears_frames_apart_may_have_a_longer_silence(firmware_libra
     ask = rtu_frame(1, struct.pack(">BHH", 3, 0, 2))
     board.hear(ask[:3])
     board.pass_us(15_000)
-    assert board.ask_frame(ask[3:]) == rtu_frame(1, bytes.fromhex("03044d420002"))
+    assert board.ask_frame(ask[3:]) == rtu_frame(1, bytes.fromhex("03044d420003"))
 
 
 def test_other_units_are_left_alone_and_a_broadcast_is_obeyed_without_an_answer(virtual_board: VirtualBoard) -> None:

@@ -16,6 +16,7 @@ import random
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface import conformance, roles
+from firmware_iface.board_settings import record
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.lasers import three_bytes
 from tests.board.gdb_wire import StoppedBoard, stopped
@@ -74,8 +76,13 @@ class Stm32:
 
 @contextlib.asynccontextmanager
 async def stm32(folder: Path) -> AsyncIterator[Stm32]:
-    """Build the image for QEMU, start it, end it afterwards."""
+    """Build the image for QEMU, start it, end it afterwards.
+
+    Its settings are those of the port, without the gauge: QEMU has no converter that could read one.
+    """
     image, settings = make(folder, "stm32f4-qemu.bin", "settings.bin")
+    table = tomllib.loads((PORT / "board.toml").read_text(encoding="utf-8"))
+    settings.write_bytes(record({**table, "gauge_fitted": False}))
     lasers: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
     server = await asyncio.start_server(lambda _, writer: lasers.put_nowait(writer), "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
@@ -131,7 +138,7 @@ async def test_the_image_starts_safe_answers_and_drives_its_outputs(tmp_path: Pa
     async with stm32(tmp_path) as board:
         driver = PumpBoard(board.url, timeout_s=4.0, watchdog_s=10.0)
         identity = await driver.identify()
-        assert (identity.map_version, identity.firmware) == (2, "1.0.0")
+        assert (identity.map_version, identity.firmware, identity.gauge_fitted) == (3, "1.1.0", False)
         assert identity.gauge_pressure_limit_pa == 800.0
         reading = await driver.read()
         assert (await board.word(CCR1), await board.word(CCR2)) == (0, 0)
@@ -140,6 +147,7 @@ async def test_the_image_starts_safe_answers_and_drives_its_outputs(tmp_path: Pa
         assert math.isnan(reading.gauge_pressure_pa)  # no DMA in QEMU: never an old or invented value
         assert math.isnan(reading.displacement_um)
         assert reading.displacement_quality != 0
+        assert reading.interlock_inputs == 0  # no pins in QEMU: open
         await driver.open()
         board.laser.write(frames(32_760, 1, 100))
         await driver.write(roles.BenchCommand(0.25, 1.0))

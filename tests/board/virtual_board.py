@@ -14,6 +14,7 @@ from firmware_iface.emulators.modbus_server import bitwise_crc
 from firmware_iface.links.modbus_tcp import exception_error
 
 NO_VALUE = -(2**31)
+AT_REST = (0, 0, 101_325_000, 210_000, 220_000, 0)  # raw values of all channels with a flat film
 SETTINGS = {"baud": 115_200, "parity": "N", "pressure_limit_pa": 800.0, "pump_limit_fraction": 1.0}
 _ANSWERED_US = 3000  # heard at the next turn of the main loop, answered at the first one after a silence of 1750 us
 _ASKED_US = 4000
@@ -48,6 +49,10 @@ class VirtualBoard:
         """The raw values of all channels: displacement, gauge, ambient, air, gas, quality."""
         for channel, raw in enumerate(raws):
             self.chip.virtual_set_input(channel, raw)
+
+    def set_interlocks(self, closed: int) -> None:
+        """Close these interlock inputs, and open the others."""
+        self.chip.virtual_set_interlocks(closed)
 
     @property
     def outputs(self) -> tuple[int, int]:

@@ -88,10 +88,10 @@ def bench(version: int, tmp_path: Path) -> Iterator[Bench]:
     made.close()
 
 
-both_maps = pytest.mark.parametrize("version", [1, 2])
+every_map = pytest.mark.parametrize("version", [1, 2, 3])
 
 
-@both_maps
+@every_map
 def test_it_stops_the_pump_under_a_holder_and_changes_nothing_of_his(
     bench: Bench, version: int, tmp_path: Path
 ) -> None:
@@ -177,7 +177,7 @@ def test_nobody_there_is_said_in_one_line(
         make_safe(config, "lab.toml")
 
 
-@both_maps
+@every_map
 def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> None:
     """As from another machine, where no lock is seen; with another watchdog period in its configuration."""
     before = bench.board.state.read(48, 2) + bench.board.state.read(56, 3)

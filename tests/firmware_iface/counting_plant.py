@@ -13,6 +13,7 @@ class CountingPlant:
     def __init__(self) -> None:
         self.counter = 0
         self.gauge_pressure_pa = 600.0
+        self.interlock_inputs = 0xFFFF
         self.outputs: list[tuple[float, float]] = []
         self.actuated = asyncio.Event()
 
@@ -31,6 +32,7 @@ class CountingPlant:
             gas_temperature_c=-3.125,
             sample_counter=self.counter,
             device_time_s=self.counter / 128,
+            interlock_inputs=self.interlock_inputs,
         )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:

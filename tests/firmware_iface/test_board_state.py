@@ -9,20 +9,23 @@ from typing import Any
 import pytest
 
 from firmware_iface.emulators.modbus_server import RegisterRefusal
-from firmware_iface.emulators.pump_board import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState
+from firmware_iface.emulators.pump_board import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState, StoredSettings
 from firmware_iface.register_map import known_maps
 
 SAMPLE = BoardSample(1.5, 0, 600.0, 101_325.0, 20.0, 21.0, 7, 3.25)
 PERIOD_S = 0.5
+DELIVERED = StoredSettings()
 KEY = 0x1234_5678
 
 
 class Bench:
     """A board with a manual clock, claimed where it supports claims."""
 
-    def __init__(self, version: int, key: int = KEY) -> None:
+    def __init__(
+        self, version: int, key: int = KEY, stored: StoredSettings = DELIVERED, sample: BoardSample = SAMPLE
+    ) -> None:
         self.map = known_maps()[version]
-        self.state = BoardState(self.map, SAMPLE)
+        self.state = BoardState(self.map, sample, stored)
         self.now_s = 0.0
         self.claim = {"claim_id": 7, "claim_key": key, "command_key": key, "clear_key": key}
 
@@ -51,7 +54,7 @@ class Bench:
         self.put("reset", clear_faults=mask)
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=[1, 2, 3])
 def bench(request: pytest.FixtureRequest) -> Bench:
     """What boards of every map do."""
     return Bench(request.param)
@@ -63,13 +66,18 @@ def old() -> Bench:
     return Bench(1)
 
 
-@pytest.fixture
-def claimed() -> Bench:
+def pumping(version: int = 3, stored: StoredSettings = DELIVERED) -> Bench:
     """A board that is claimed and armed, with its pump running."""
-    made = Bench(2)
+    made = Bench(version, stored=stored)
     made.arm()
     made.command(0.3, 1, vent=0.25)
     return made
+
+
+@pytest.fixture(params=[2, 3])
+def claimed(request: pytest.FixtureRequest) -> Bench:
+    """A board with claims, its pump running."""
+    return pumping(request.param)
 
 
 def test_power_up_is_off_and_unarmed(bench: Bench) -> None:
@@ -93,7 +101,7 @@ def test_watchdog_period_is_strict(bench: Bench) -> None:
 def test_new_heartbeats_keep_it_fed(bench: Bench) -> None:
     bench.arm()
     for tick in range(1, 200):
-        bench.at(tick * 0.4)
+        bench.at(tick * 0.4, replace(SAMPLE, gauge_pressure_pa=600.0 + 0.001 * tick))
         bench.command(0.3, tick % 2)
     assert bench.state.pump_fraction == 0.3
 
@@ -225,7 +233,9 @@ def test_a_refused_write_changes_nothing(old: Bench, address: int, words: list[i
     assert old.everything() == before
 
 
-@pytest.mark.parametrize(("address", "count"), [(7, 1), (6, 2), (15, 2), (30, 20), (67, 1), (65_535, 1), (65_535, 2)])
+@pytest.mark.parametrize(
+    ("address", "count"), [(11, 1), (10, 2), (15, 2), (30, 20), (67, 1), (65_535, 1), (65_535, 2)]
+)
 def test_unknown_addresses_cannot_be_read(bench: Bench, address: int, count: int) -> None:
     with pytest.raises(RegisterRefusal) as refused:
         bench.state.read(address, count)

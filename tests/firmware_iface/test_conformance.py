@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ from counting_plant import CountingPlant, ManualClock
 from firmware_iface.conformance import CheckResult, Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.modbus_server import ILLEGAL_VALUE, RegisterRefusal, respond
-from firmware_iface.emulators.pump_board import BoardSample, BoardState
+from firmware_iface.emulators.pump_board import BoardSample, BoardState, StoredSettings
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
@@ -24,6 +25,7 @@ from tests.support.faulty_board import PumpBoardEmulator
 from tests.support.faulty_devices import RtuBusEmulator
 
 PUMP, VENT, HEARTBEAT = 56, 57, 58
+DELIVERED = StoredSettings()
 
 
 class NoWatchdog(BoardState):
@@ -157,6 +159,62 @@ class StopsForATick(BoardState):
         super()._latch(mask & ~self._stopped_mask)
 
 
+class NoGaugeGuard(BoardState):
+    """Pumps without a gauge."""
+
+    @property
+    def _gauge_lost(self) -> bool:
+        return False
+
+
+class ShortMemory(BoardState):
+    """Gives the pump a whole time-out again whenever the fault is cleared."""
+
+    def write(self, address: int, words: Sequence[int]) -> None:
+        if address == 64:
+            self._gauge_seen_s = self._now_s
+        super().write(address, words)
+
+
+class VentsWithoutGauge(BoardState):
+    """Opens the vent when it loses its gauge."""
+
+    @property
+    def vent_fraction(self) -> float:
+        return 1.0 if self._faults & self._gauge_lost_mask else super().vent_fraction
+
+
+class NoLatch(BoardState):
+    """Stops the pump while the cause lasts, without a latched fault."""
+
+    def _protect(self) -> None:
+        super()._protect()
+        self._faults = 0
+
+
+class NoInterlock(BoardState):
+    """Reports its interlock inputs, and does nothing."""
+
+    def _latch(self, mask: int) -> None:
+        if mask != self._interlock_mask:
+            super()._latch(mask)
+
+
+class StopsWithoutCause(BoardState):
+    """Takes every gauge for lost, once the pump runs."""
+
+    @property
+    def _gauge_lost(self) -> bool:
+        return True
+
+
+class OddSettings(BoardState):
+    """Has a time-out that no board may have."""
+
+    def _values(self) -> dict[str, float]:
+        return super()._values() | {"gauge_timeout_s": 0.05}
+
+
 class OtherMap(BoardState):
     """Of a later map."""
 
@@ -182,6 +240,7 @@ class Bench:
 
     board: PumpBoardEmulator
     clock: ManualClock
+    plant: ClockedPlant
 
     async def examine(self) -> list[CheckResult]:
         async def sleep(duration_s: float) -> None:
@@ -196,16 +255,19 @@ class Bench:
             await link.close()
 
 
+Serve = Callable[..., Awaitable[Bench]]
+
+
 @pytest.fixture
-async def serve() -> AsyncIterator[Callable[[type[BoardState], int], Awaitable[Bench]]]:
+async def serve() -> AsyncIterator[Serve]:
     benches: list[Bench] = []
 
-    async def make(kind: type[BoardState], version: int = 2) -> Bench:
+    async def make(kind: type[BoardState], version: int = 3, stored: StoredSettings = DELIVERED) -> Bench:
         clock = ManualClock()
         plant = ClockedPlant(clock)
         registers = known_maps()[version]
-        bench = Bench(PumpBoardEmulator(plant, clock=clock, registers=registers), clock)
-        bench.board.state = kind(registers, plant.sample())
+        bench = Bench(PumpBoardEmulator(plant, clock=clock, registers=registers), clock, plant)
+        bench.board.state = kind(registers, plant.sample(), stored)
         benches.append(bench)
         await bench.board.start()
         return bench
@@ -219,10 +281,8 @@ def problems(findings: list[CheckResult]) -> dict[str, str]:
     return {finding.check: finding.problem for finding in findings if finding.problem}
 
 
-@pytest.mark.parametrize(("version", "checks"), [(1, 14), (2, 21)])
-async def test_the_emulator_conforms(
-    serve: Callable[[type[BoardState], int], Awaitable[Bench]], version: int, checks: int
-) -> None:
+@pytest.mark.parametrize(("version", "checks"), [(1, 14), (2, 21), (3, 22)])
+async def test_the_emulator_conforms(serve: Serve, version: int, checks: int) -> None:
     bench = await serve(BoardState, version)
     findings = await bench.examine()
     assert problems(findings) == {}
@@ -256,7 +316,7 @@ BROKEN = [
     (Frozen, "samples advance", "sample_counter stands still"),
     (ForgetsPeriod, "settings are read back as written", "written 0.3, read back 1"),
     (StartsWhenCleared, "clearing sets the pump to 0", "starts the pump at 0.05"),
-    (OtherMap, "identity", "map version is 7, this test knows 1 and 2"),
+    (OtherMap, "identity", "map version is 7, this test knows 1, 2, 3"),
 ]
 CLAIMS_BROKEN = [
     (Claimless, "another claim is refused", "accepts a second claim"),
@@ -268,27 +328,95 @@ CLAIMS_BROKEN = [
     (ClaimFeeds, "the same claim may be made again", "claims that are made again"),
     (StopsForATick, "anybody may stop the pump", "runs the pump at 0.05 after stop"),
 ]
+GUARDS_BROKEN = [
+    (StopsWithoutCause, "a gauge with a value and closed interlocks let the pump run", "faults 0x8 without a cause"),
+    (OddSettings, "identity", "gauge_timeout_s is 0.05, expected 0.1..60"),
+]
+NOT_RUN = "all other requirements"
+WITHOUT_GAUGE = "without a gauge the pump is off after the time-out"
+CLEARED_WITHOUT_GAUGE = "clearing does not run the pump without a gauge"
+OPEN, CLEARED_OPEN = ("an open interlock keeps the pump off", "clearing does not run the pump with an open interlock")
 
 
 @pytest.mark.parametrize(
     ("version", "kind", "check", "words"),
-    [(2, *row) for row in BROKEN + CLAIMS_BROKEN] + [(1, *row) for row in BROKEN if row[0] is AnyWriteFeeds],
+    [(3, *row) for row in BROKEN + CLAIMS_BROKEN + GUARDS_BROKEN]
+    + [(2, *row) for row in CLAIMS_BROKEN]
+    + [(1, *row) for row in BROKEN if row[0] is AnyWriteFeeds],
 )
 async def test_a_broken_board_fails_for_the_right_reason(
-    serve: Callable[[type[BoardState], int], Awaitable[Bench]],
-    version: int,
-    kind: type[BoardState],
-    check: str,
-    words: str,
+    serve: Serve, version: int, kind: type[BoardState], check: str, words: str
 ) -> None:
     bench = await serve(kind, version)
     found = problems(await bench.examine())
     assert words in found[check]
 
 
-async def test_a_board_that_somebody_holds_is_left_alone(
-    serve: Callable[[type[BoardState]], Awaitable[Bench]],
+async def test_without_a_gauge_the_guard_is_tested_and_the_rest_is_not(serve: Serve) -> None:
+    bench = await serve(BoardState)
+    bench.plant.gauge_pressure_pa = math.nan
+    findings = await bench.examine()
+    assert [finding.check for finding in findings if not finding.problem][-2:] == [
+        WITHOUT_GAUGE,
+        CLEARED_WITHOUT_GAUGE,
+    ]
+    assert problems(findings) == {NOT_RUN: "not run: the fitted gauge has no value; connect it and run it again"}
+    assert bench.board.state.pump_fraction == 0.0
+
+
+async def test_with_an_open_interlock_the_interlock_is_tested_and_the_rest_is_not(serve: Serve) -> None:
+    bench = await serve(BoardState, stored=StoredSettings(interlocks_fitted=0b101))
+    bench.plant.interlock_inputs = 0b011
+    findings = await bench.examine()
+    assert [finding.check for finding in findings if not finding.problem][-2:] == [OPEN, CLEARED_OPEN]
+    assert problems(findings) == {NOT_RUN: "not run: interlock inputs 0x4 are open; close them and run it again"}
+
+
+@pytest.mark.parametrize("stored", [StoredSettings(gauge_fitted=False), StoredSettings(interlocks_fitted=0b11)])
+async def test_a_board_without_a_gauge_or_with_closed_interlocks_conforms(
+    serve: Serve, stored: StoredSettings
 ) -> None:
+    bench = await serve(BoardState, stored=stored)
+    if not stored.gauge_fitted:
+        bench.plant.gauge_pressure_pa = math.nan
+    findings = await bench.examine()
+    assert problems(findings) == {}
+    assert len(findings) == 22
+
+
+@pytest.mark.parametrize(
+    ("kind", "check", "words"),
+    [
+        (NoGaugeGuard, WITHOUT_GAUGE, "runs the pump at 0.05 after 15 s without a gauge"),
+        (ShortMemory, CLEARED_WITHOUT_GAUGE, "runs the pump at 0.05 after a command without a gauge"),
+        (VentsWithoutGauge, WITHOUT_GAUGE, "moves the vent after 15 s without a gauge"),
+        (NoLatch, WITHOUT_GAUGE, "does not latch the fault `gauge_lost`"),
+    ],
+)
+async def test_a_board_with_a_bad_guard_of_its_gauge_fails(
+    serve: Serve, kind: type[BoardState], check: str, words: str
+) -> None:
+    bench = await serve(kind)
+    bench.plant.gauge_pressure_pa = math.nan
+    assert words in problems(await bench.examine())[check]
+
+
+@pytest.mark.parametrize(
+    ("kind", "check", "words"),
+    [
+        (NoInterlock, OPEN, "runs the pump at 0.05 after a command with an open interlock"),
+        (NoLatch, CLEARED_OPEN, "does not latch the fault `interlock`"),
+    ],
+)
+async def test_a_board_with_a_bad_interlock_fails(
+    serve: Serve, kind: type[BoardState], check: str, words: str
+) -> None:
+    bench = await serve(kind, stored=StoredSettings(interlocks_fitted=1))
+    bench.plant.interlock_inputs = 0xFFFE
+    assert words in problems(await bench.examine())[check]
+
+
+async def test_a_board_that_somebody_holds_is_left_alone(serve: Serve) -> None:
     bench = await serve(BoardState)
     holder = PumpBoard(f"tcp://127.0.0.1:{bench.board.port}", timeout_s=5.0)
     await holder.open()

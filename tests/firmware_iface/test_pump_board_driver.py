@@ -12,6 +12,7 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
+from firmware_iface.emulators.pump_board import StoredSettings
 from firmware_iface.links.modbus_rtu import parse_tcp_url
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import (
@@ -27,7 +28,7 @@ from tests.support.faulty_board import Faults, PumpBoardEmulator
 
 WATCHDOG_S = 0.5
 OFF = BenchCommand(0.0, 0.0)
-both_maps = pytest.mark.parametrize("map_version", [1, 2])
+every_map = pytest.mark.parametrize("map_version", [1, 2, 3])
 
 
 @pytest.fixture
@@ -50,12 +51,15 @@ def agrees(reading: BenchReading) -> bool:
     )
 
 
-@both_maps
+@every_map
 async def test_open_says_who_answers_and_arms_the_watchdog(
     driver: PumpBoard, board: PumpBoardEmulator, map_version: int
 ) -> None:
     identity = await driver.open()
-    assert identity == BenchIdentity("membrane pump board", map_version, "1.0.0", WATCHDOG_S, 800.0, 1.0)
+    gauge_timeout_s = 15.0 if map_version == 3 else math.inf
+    assert identity == BenchIdentity(
+        "membrane pump board", map_version, "1.1.0", WATCHDOG_S, 800.0, 1.0, gauge_timeout_s=gauge_timeout_s
+    )
     assert board.state.read(48, 2) == [500, 1]
     assert (await driver.read()).foreign == 0
 
@@ -70,7 +74,31 @@ async def test_a_reading_is_one_new_sample_in_si_units(driver: PumpBoard, plant:
     assert (reading.displacement_quality, reading.watchdog_tripped, reading.latched_faults) == (0, False, 0)
 
 
-@both_maps
+@every_map
+async def test_interlock_inputs_are_read_where_the_board_has_them(
+    driver: PumpBoard, plant: CountingPlant, map_version: int
+) -> None:
+    plant.interlock_inputs = 0b1010
+    await driver.open()
+    assert (await driver.read()).interlock_inputs == (0b1010 if map_version == 3 else 0)
+
+
+@pytest.mark.parametrize(
+    ("stored", "found"),
+    [
+        (StoredSettings(), (True, 15.0, 0)),
+        (StoredSettings(gauge_fitted=False, gauge_timeout_s=2.5, interlocks_fitted=6), (False, 2.5, 6)),
+    ],
+)
+async def test_the_identity_states_which_protections_the_board_has(
+    driver: PumpBoard, board: PumpBoardEmulator, stored: StoredSettings, found: tuple[bool, float, int]
+) -> None:
+    board.state.stored = stored
+    identity = await driver.identify()
+    assert (identity.gauge_fitted, identity.gauge_timeout_s, identity.interlocks_fitted) == found
+
+
+@every_map
 async def test_a_command_reaches_the_plant_and_is_read_back(driver: PumpBoard, plant: CountingPlant) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.125, 1.0))
@@ -114,7 +142,7 @@ def test_a_watchdog_period_the_board_cannot_have_is_refused(watchdog_s: float) -
 
 async def test_an_unknown_map_version_is_refused_with_both_named(driver: PumpBoard, board: PumpBoardEmulator) -> None:
     board.faults.map_version = 9
-    with pytest.raises(DeviceRefusedError, match="version 9, this program knows 1 and 2"):
+    with pytest.raises(DeviceRefusedError, match="version 9, this program knows 1, 2, 3"):
         await driver.open()
     assert board.state.read(49, 1) == [0]  # nothing was written to it
     with pytest.raises(LinkDownError):
@@ -130,7 +158,7 @@ async def test_another_kind_of_device_is_refused(
         await driver.open()
 
 
-@both_maps
+@every_map
 async def test_a_watchdog_that_does_not_take_its_setting_is_refused(
     driver: PumpBoard, board: PumpBoardEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,7 +285,7 @@ async def test_writing_every_tick_keeps_the_pump_on(
     await driver.write(OFF)
 
 
-@both_maps
+@every_map
 async def test_after_a_trip_only_a_person_gets_the_pump_back(
     driver: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
@@ -278,7 +306,7 @@ async def test_after_a_trip_only_a_person_gets_the_pump_back(
     await driver.write(OFF)
 
 
-@both_maps
+@every_map
 async def test_a_reconnect_within_the_period_goes_on_without_a_trip(
     driver: PumpBoard, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
 ) -> None:
@@ -297,7 +325,7 @@ async def test_a_reconnect_within_the_period_goes_on_without_a_trip(
     await driver.write(OFF)
 
 
-@both_maps
+@every_map
 async def test_a_restarted_board_is_not_read_on(driver: PumpBoard, board: PumpBoardEmulator) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
@@ -318,7 +346,7 @@ async def test_over_pressure_is_acted_on_by_the_board_itself(driver: PumpBoard, 
     assert (await driver.read()).latched_faults == default_map().fault_mask("over_pressure")
 
 
-@both_maps
+@every_map
 async def test_a_clean_close_disarms_the_watchdog(
     driver: PumpBoard, board: PumpBoardEmulator, clock: ManualClock
 ) -> None:
@@ -330,7 +358,7 @@ async def test_a_clean_close_disarms_the_watchdog(
     assert not (await driver.read()).watchdog_tripped
 
 
-@both_maps
+@every_map
 async def test_a_close_with_the_pump_on_leaves_it_to_the_watchdog(
     driver: PumpBoard, plant: CountingPlant, clock: ManualClock
 ) -> None:

@@ -40,11 +40,14 @@ def test_sensor_and_command_blocks_are_one_transaction_each() -> None:
 
 
 def test_an_earlier_map_is_the_newest_without_what_came_later() -> None:
-    newest, first = default_map(), known_maps()[1]
-    assert (newest.map_version, first.map_version) == (2, 1)
+    newest, second, first = default_map(), known_maps()[2], known_maps()[1]
+    assert (newest.map_version, second.map_version, first.map_version) == (3, 2, 1)
+    assert [register for register in newest if register.since <= 2] == list(second)
+    assert [fault.name for fault in second.faults] == ["watchdog", "over_pressure", "stopped"]
+    assert [(block.address, block.count) for block in second.blocks[:2]] == [(0, 7), (16, 25)]
     assert [register for register in newest if register.since == 1] == list(first)
     assert [(block.address, block.count) for block in first.blocks] == [(0, 7), (16, 22), (48, 2), (56, 3), (64, 1)]
-    for version in (0, 3):
+    for version in (0, 4):
         with pytest.raises(RegisterMapError, match=f"map version {version} is none of"):
             newest.of_version(version)
 
@@ -143,7 +146,7 @@ def _edit(table: dict[str, Any], block: int, register: int, **changes: Any) -> d
         (3, 0, {"max": 2.0}, "pump_command_fraction: a limit is out of its type"),
         (1, 4, {"min": 0, "max": 1}, "displacement_um: .* a ro one has no limits"),
         (4, 0, {"address": 65536}, "clear_faults: address 65536 is outside"),
-        (1, 16, {"since": 3}, "claim_in_force: since must be a map version, 1..2"),
+        (1, 17, {"since": 4}, "interlock_inputs: since must be a map version, 1..3"),
         (1, 0, {"since": 2}, "device_time_s is older than sample_counter before it"),
         (3, 0, {"meaning": None}, "pump_command_fraction: meaning is missing"),
         (3, 2, {"name": "vent_command_fraction", "unit": "fraction"}, "vent_command_fraction is there twice"),

@@ -8,7 +8,7 @@
 #include "rtu.h"
 #include "settings.h"
 
-#define UNFED_MAX_US 1000000000 /* the age of the last feed stops here: longer than every period, and no overflow */
+#define AGE_MAX_US 1000000000u /* ages stop here: longer than every period and time-out, and no overflow */
 #define PERIOD_AT_START_MS 1000u
 #define QUALITY_UNKNOWN 0xFFFF /* of a laser that says nothing */
 
@@ -33,6 +33,10 @@ struct state {
     uint32_t heartbeat;     /* written last */
     uint32_t heartbeat_fed; /* that fed last */
     uint32_t faults;
+    uint32_t interlocks;       /* bit i: the circuit of input i is closed, at the newest sample */
+    uint32_t gauge_missing_us; /* since the gauge last had a value; AGE_MAX_US: not since power-up */
+    int32_t gauge_mpa;         /* its newest value; HAL_NO_VALUE before the first one */
+    uint32_t gauge_same_us;    /* of pumping since this value changed, or since a person cleared `gauge_lost` */
 };
 
 static union {
@@ -65,6 +69,8 @@ void board_start(void)
         now.state.sensors[i] = HAL_NO_VALUE;
     }
     now.state.sensors[HAL_DISPLACEMENT_QUALITY] = QUALITY_UNKNOWN;
+    now.state.gauge_missing_us = AGE_MAX_US;
+    now.state.gauge_mpa = HAL_NO_VALUE;
     now.state.period_ms = PERIOD_AT_START_MS;
     now.state.tick_us = hal_micros();
     seal();
@@ -106,6 +112,50 @@ static void latch(struct state *state, uint32_t fault)
     state->pump = 0u; /* nothing moves when the fault is cleared */
 }
 
+static uint32_t age_after(uint32_t age_us, uint32_t elapsed_us)
+{
+    return (elapsed_us < (AGE_MAX_US - age_us)) ? (age_us + elapsed_us) : AGE_MAX_US;
+}
+
+/* The gauge protects only while its values are new: for how long has it had none, or the same one? */
+static void watch_gauge(struct state *state, uint32_t elapsed_us)
+{
+    const int32_t gauge_mpa = state->sensors[HAL_GAUGE_PRESSURE];
+    const bool present = gauge_mpa != HAL_NO_VALUE;
+    state->gauge_missing_us = present ? 0u : age_after(state->gauge_missing_us, elapsed_us);
+    if (pump_driven(state) > 0u) {
+        state->gauge_same_us = age_after(state->gauge_same_us, elapsed_us);
+    }
+    if (present && (gauge_mpa != state->gauge_mpa)) {
+        state->gauge_mpa = gauge_mpa;
+        state->gauge_same_us = 0u;
+    }
+}
+
+static bool gauge_lost(const struct state *state)
+{
+    const struct settings *settings = &state->settings;
+    const bool missing = state->gauge_missing_us > (settings->gauge_timeout_ms * 1000u);
+    const bool frozen =
+        (settings->gauge_frozen_ms != 0u) && (state->gauge_same_us > (settings->gauge_frozen_ms * 1000u));
+    return (settings->gauge_fitted != 0u) && (missing || frozen);
+}
+
+/* Judged in every tick and after every write, so that no command drives the pump even for a tick.
+ *
+ * A lost gauge matters only to a pump that is to run. Its age goes on while the fault is latched and when it is cleared:
+ * without a new value the pump does not run again. An open circuit latches always: that somebody pressed an emergency
+ * stop must not be forgotten because the pump was off at that moment. */
+static void protect(struct state *state)
+{
+    if ((state->pump > 0u) && gauge_lost(state)) {
+        latch(state, MEMBRANE_FAULT_GAUGE_LOST);
+    }
+    if ((state->settings.interlocks_fitted & ~state->interlocks) != 0u) {
+        latch(state, MEMBRANE_FAULT_INTERLOCK);
+    }
+}
+
 static void sample(struct state *state)
 {
     for (uint32_t i = 0u; i < (uint32_t)HAL_ANALOG_CHANNELS; i++) {
@@ -113,6 +163,7 @@ static void sample(struct state *state)
     }
     const int32_t quality = hal_input(HAL_DISPLACEMENT_QUALITY);
     state->sensors[HAL_DISPLACEMENT_QUALITY] = (quality == HAL_NO_VALUE) ? QUALITY_UNKNOWN : quality;
+    state->interlocks = hal_interlocks() & 0xFFFFu;
     state->sample_counter++;
     state->sample_s = state->up_s;
     state->sample_us = state->up_us;
@@ -129,10 +180,9 @@ static void pass(struct state *state, uint32_t elapsed_us)
         state->up_us -= 1000000u;
         state->up_s++;
     }
-    const uint32_t most_us = (uint32_t)UNFED_MAX_US;
-    state->unfed_us += (int32_t)((elapsed_us < most_us) ? elapsed_us : most_us);
-    if (state->unfed_us > UNFED_MAX_US) {
-        state->unfed_us = UNFED_MAX_US;
+    state->unfed_us += (int32_t)((elapsed_us < AGE_MAX_US) ? elapsed_us : AGE_MAX_US);
+    if (state->unfed_us > (int32_t)AGE_MAX_US) {
+        state->unfed_us = (int32_t)AGE_MAX_US;
     }
 }
 
@@ -158,6 +208,8 @@ void board_tick(void)
         state->next_sample_us = BOARD_SAMPLE_US;
         sample(state);
     }
+    watch_gauge(state, elapsed_us);
+    protect(state);
     if ((state->armed != 0u) && !fed_in_time(state)) {
         latch(state, MEMBRANE_FAULT_WATCHDOG);
     }
@@ -192,6 +244,10 @@ static void identify(const struct state *state, uint16_t *image)
     put(image, MEMBRANE_GAUGE_PRESSURE_LIMIT_PA_ADDRESS,
         bits_of((float)state->settings.pressure_limit_mpa / 1000.0f));
     image[MEMBRANE_PUMP_LIMIT_FRACTION_ADDRESS] = (uint16_t)state->settings.pump_limit;
+    image[MEMBRANE_GAUGE_FITTED_ADDRESS] = (uint16_t)state->settings.gauge_fitted;
+    image[MEMBRANE_GAUGE_TIMEOUT_S_ADDRESS] = (uint16_t)state->settings.gauge_timeout_ms;
+    image[MEMBRANE_GAUGE_FROZEN_S_ADDRESS] = (uint16_t)(state->settings.gauge_frozen_ms / 10u);
+    image[MEMBRANE_INTERLOCKS_FITTED_ADDRESS] = (uint16_t)state->settings.interlocks_fitted;
 }
 
 static void report(const struct state *state, uint16_t *image)
@@ -213,6 +269,7 @@ static void report(const struct state *state, uint16_t *image)
     image[MEMBRANE_LATCHED_FAULTS_ADDRESS] = (uint16_t)state->faults;
     image[MEMBRANE_PERIOD_IN_FORCE_S_ADDRESS] = (uint16_t)state->period_ms;
     put(image, MEMBRANE_CLAIM_IN_FORCE_ADDRESS, state->claim_id);
+    image[MEMBRANE_INTERLOCK_INPUTS_ADDRESS] = (uint16_t)state->interlocks;
 }
 
 /* What was written and can be read; keys, clear_faults and stop read as 0. */
@@ -353,6 +410,9 @@ static enum board_answer write_reset(struct state *state, const uint16_t *words)
         if ((cleared & MEMBRANE_FAULT_WATCHDOG) != 0u) {
             feed(state);
         }
+        if ((cleared & MEMBRANE_FAULT_GAUGE_LOST) != 0u) {
+            state->gauge_same_us = 0u; /* a gauge at rest shows that it works only once the pump runs */
+        }
     }
     return answer;
 }
@@ -374,6 +434,7 @@ static enum board_answer write_block(struct state *state, uint32_t address, cons
         latch(state, MEMBRANE_FAULT_STOPPED);
         break;
     }
+    protect(state);
     return answer;
 }
 

@@ -7,7 +7,7 @@
 
 #include "membrane_board.h"
 
-#define BOARD_FIRMWARE_VERSION 0x00010000u /* 1.0.0 */
+#define BOARD_FIRMWARE_VERSION 0x00010100u /* 1.1.0 */
 #define BOARD_WORDS (MEMBRANE_STOP_ADDRESS + 1u) /* addresses 0..BOARD_WORDS-1, some of them unused */
 #define BOARD_SAMPLE_US 5000u    /* between two samples of the sensors */
 #define BOARD_STALLED_TICKS 20u  /* a main loop that has not turned for so long is frozen */
@@ -24,7 +24,7 @@ void board_start(void);
 const struct settings *board_settings(void);
 
 /* From the timer interrupt, every millisecond: verifies the memory, samples the sensors, lets the pressure limit and the
- * watchdog act, drives the outputs, feeds the hardware watchdog. */
+ * watchdog act, drives the outputs, feeds the hardware watchdog. A lost gauge and an open interlock act here as well. */
 void board_tick(void);
 
 /* From the main loop, at least every 20 ms: answers what arrived on the UART. */

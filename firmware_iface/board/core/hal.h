@@ -9,8 +9,8 @@
  * no supply, or drives no pin (pull-downs). Handlers of faults (hard fault, stack overflow, unexpected interrupt) drive
  * the safe state directly and then reset the processor; they call nothing of the core.
  *
- * Interrupts: only hal_micros(), hal_input(), hal_outputs(), hal_watchdog_feed() and hal_reset() are called from
- * board_tick(). None of them may wait for anything. */
+ * Interrupts: only hal_micros(), hal_input(), hal_interlocks(), hal_outputs(), hal_watchdog_feed() and hal_reset() are
+ * called from board_tick(). None of them may wait for anything. */
 #ifndef MEMBRANE_HAL_H
 #define MEMBRANE_HAL_H
 
@@ -50,6 +50,10 @@ uint32_t hal_micros(void);
  * digital sensor sent. Conversions run in the background; this function only fetches. A value that has not been renewed
  * for 100 ms is HAL_NO_VALUE, never the last one. */
 int32_t hal_input(enum hal_input_channel channel);
+
+/* Interlock inputs 0..15: bit i is set while the circuit of input i is closed. An input is normally closed: a cut wire, a
+ * lost supply, an input that the port does not have and one that was not read for 10 ms are open, and their bit is 0. */
+uint32_t hal_interlocks(void);
 
 /* Drives pump and vent, 0..HAL_FULL_SCALE. Called every millisecond. The pump's stage should need these calls as well:
  * an enable by charge pump or monostable that drops out when they cease for 20 ms. */

@@ -22,8 +22,8 @@ struct register_limits {
 #define REGISTER_LIMITS_COUNT 11u
 
 static const struct register_block REGISTER_BLOCKS[REGISTER_BLOCKS_COUNT] = {
-    {0u, 7u, false}, /* identity */
-    {16u, 25u, false}, /* sensors */
+    {0u, 11u, false}, /* identity */
+    {16u, 26u, false}, /* sensors */
     {48u, 6u, true}, /* settings */
     {56u, 5u, true}, /* command */
     {64u, 3u, true}, /* reset */

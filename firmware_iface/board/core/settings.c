@@ -11,6 +11,9 @@ static const struct settings WITHOUT_RECORD = {
     .parity = (uint32_t)HAL_PARITY_EVEN,
     .silence_us = 2006u,
     /* scales: divisor 0, so that no channel has a value */
+    .gauge_fitted = 1u,
+    .gauge_timeout_ms = SETTINGS_GAUGE_TIMEOUT_MS,
+    .gauge_frozen_ms = SETTINGS_GAUGE_FROZEN_MS,
 };
 
 uint32_t settings_crc32(const uint8_t *bytes, size_t count)
@@ -67,14 +70,31 @@ static bool usable(const struct settings *found)
     for (uint32_t i = 0u; i < (uint32_t)HAL_ANALOG_CHANNELS; i++) {
         right = right && (found->scales[i].divisor > 0);
     }
+    right = right && within(found->gauge_fitted, 0u, 1u) && within(found->gauge_timeout_ms, 100u, 60000u) &&
+            ((found->gauge_frozen_ms == 0u) || within(found->gauge_frozen_ms, 1000u, 600000u)) &&
+            within(found->interlocks_fitted, 0u, 0xFFFFu);
     return right && within(found->silence_us, settings_standard_silence_us(found->baud), 1000000u);
+}
+
+/* The length that the record states, if it is one of the two, its bytes are there and their CRC is right; otherwise 0. */
+static size_t sound_length(const uint8_t *record, size_t length)
+{
+    size_t found = 0u;
+    if ((record != NULL) && (length >= SETTINGS_BYTES_MAP_2) && (word_at(record, 0u) == SETTINGS_MAGIC)) {
+        const uint32_t stated = word_at(record, 1u);
+        const bool known = (stated == SETTINGS_BYTES) || (stated == SETTINGS_BYTES_MAP_2);
+        if (known && (stated <= length) &&
+            (word_at(record, (stated / 4u) - 1u) == settings_crc32(record, stated - 4u))) {
+            found = stated;
+        }
+    }
+    return found;
 }
 
 struct settings settings_load(const uint8_t *record, size_t length)
 {
-    if ((record == NULL) || (length < SETTINGS_BYTES) || (word_at(record, 0u) != SETTINGS_MAGIC) ||
-        (word_at(record, 1u) != SETTINGS_BYTES) ||
-        (word_at(record, (SETTINGS_BYTES / 4u) - 1u) != settings_crc32(record, SETTINGS_BYTES - 4u))) {
+    const size_t stated = sound_length(record, length);
+    if (stated == 0u) {
         return WITHOUT_RECORD;
     }
     struct settings found = {
@@ -84,9 +104,20 @@ struct settings settings_load(const uint8_t *record, size_t length)
         .silence_us = word_at(record, 5u),
         .pressure_limit_mpa = word_at(record, 6u),
         .pump_limit = word_at(record, 7u),
+        .gauge_fitted = WITHOUT_RECORD.gauge_fitted,
+        .gauge_timeout_ms = WITHOUT_RECORD.gauge_timeout_ms,
+        .gauge_frozen_ms = WITHOUT_RECORD.gauge_frozen_ms,
+        .interlocks_fitted = WITHOUT_RECORD.interlocks_fitted,
     };
     for (uint32_t i = 0u; i < (uint32_t)HAL_ANALOG_CHANNELS; i++) {
         found.scales[i] = scale_at(record, HEAD_WORDS + (SCALE_WORDS * i));
+    }
+    if (stated == SETTINGS_BYTES) {
+        const uint32_t at = HEAD_WORDS + (SCALE_WORDS * (uint32_t)HAL_ANALOG_CHANNELS);
+        found.gauge_fitted = word_at(record, at);
+        found.gauge_timeout_ms = word_at(record, at + 1u);
+        found.gauge_frozen_ms = word_at(record, at + 2u);
+        found.interlocks_fitted = word_at(record, at + 3u);
     }
     return usable(&found) ? found : WITHOUT_RECORD;
 }

@@ -13,11 +13,11 @@ static void take_digit(struct bench_line *line, int64_t digit)
     if (!line->begun) {
         line->begun = true;
         line->count++;
-        if (line->count <= (uint32_t)HAL_INPUT_CHANNELS) {
+        if (line->count <= BENCH_NUMBERS) {
             line->numbers[line->count - 1u] = 0;
         }
     }
-    if (line->count <= (uint32_t)HAL_INPUT_CHANNELS) {
+    if (line->count <= BENCH_NUMBERS) {
         int64_t *number = &line->numbers[line->count - 1u];
         *number = (*number * 10) + (line->negative ? -digit : digit);
         line->right = line->right && (*number >= (int64_t)INT32_MIN) && (*number <= (int64_t)INT32_MAX);
@@ -31,7 +31,7 @@ bool bench_take(struct bench_line *line, uint8_t byte)
     if (byte == (uint8_t)'I') {
         begin(line);
     } else if (byte == (uint8_t)'\n') {
-        complete = line->right && (line->count == (uint32_t)HAL_INPUT_CHANNELS);
+        complete = line->right && (line->count == BENCH_NUMBERS);
         line->right = false;
     } else if ((byte >= (uint8_t)'0') && (byte <= (uint8_t)'9')) {
         take_digit(line, (int64_t)byte - (int64_t)'0');

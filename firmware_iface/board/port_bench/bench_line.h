@@ -1,7 +1,7 @@
 /* The wire of simulated boards to a simulated film, in lines of text.
  *
- * To the board: "I <displacement> <gauge> <ambient> <air> <gas> <quality>\n", raw values of the channels of hal.h;
- * -2147483648 is "no value". From the board: "O <pump> <vent>\n", counts of HAL_FULL_SCALE, at every change and every
+ * To the board: "I <displacement> <gauge> <ambient> <air> <gas> <quality> <interlocks>\n", raw values of the channels of
+ * hal.h, -2147483648 for "no value", and the closed interlock inputs as bits. From the board: "O <pump> <vent>\n", counts of HAL_FULL_SCALE, at every change and every
  * 5 ms. */
 #ifndef MEMBRANE_BENCH_LINE_H
 #define MEMBRANE_BENCH_LINE_H
@@ -14,10 +14,12 @@
 
 #define BENCH_STALE_US 500000u /* without a line for so long no channel has a value; a busy PC may pause the film */
 #define BENCH_SAID_MAX 24u
+#define BENCH_INTERLOCKS ((uint32_t)HAL_INPUT_CHANNELS) /* place of this number, the last one */
+#define BENCH_NUMBERS (BENCH_INTERLOCKS + 1u)
 
 struct bench_line {
-    int64_t numbers[HAL_INPUT_CHANNELS];
-    uint32_t count; /* of numbers begun; above HAL_INPUT_CHANNELS: not a line of this kind */
+    int64_t numbers[BENCH_NUMBERS];
+    uint32_t count; /* of numbers begun; above BENCH_NUMBERS: not a line of this kind */
     bool negative;
     bool begun; /* within a number */
     bool right; /* nothing unknown in this line */

@@ -2,7 +2,8 @@
  *
  * An input is a list of steps: a byte that says what happens, then what that needs. Frames that claim, command and clear
  * are at hand whole, so that mutations of them get deep. After every input the pump must be off once the watchdog's
- * period in force has passed without a word. */
+ * period in force has passed without a word. It must be off in every step while a fitted interlock is open, and once the
+ * gauge has been without a value for its time-out. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -22,8 +23,8 @@ static const char *const WHOLE[] = {
     "\x01\x10\x00\x38\x00\x05\x0a\x61\xa8\x30\xd4\x00\x05\x12\x34\x56\x78",             /* commands pump and vent */
     "\x01\x10\x00\x40\x00\x03\x06\xff\xff\x12\x34\x56\x78",                             /* clears */
     "\x01\x06\x00\x48\x00\x01",                                                         /* stops */
-    "\x01\x03\x00\x10\x00\x19",                                                         /* reads the sensors */
-    "\x01\x17\x00\x10\x00\x19\x00\x38\x00\x05\x0a\x61\xa8\x00\x00\x00\x06\x12\x34\x56\x78", /* commands and reads */
+    "\x01\x03\x00\x10\x00\x1a",                                                         /* reads the sensors */
+    "\x01\x17\x00\x10\x00\x1a\x00\x38\x00\x05\x0a\x61\xa8\x00\x00\x00\x06\x12\x34\x56\x78", /* commands and reads */
     "\x01\x08\x00\x00\x12\x34",                                                         /* query data */
 };
 static const uint8_t LENGTHS[] = {19, 17, 13, 6, 6, 21, 6};
@@ -35,6 +36,15 @@ __attribute__((destructor)) static void count_frames(void)
 {
     fprintf(stderr, "%lu frames\n", frames);
 }
+
+#define GAUGE_TIMEOUT_MS 200u
+#define INTERLOCKS_FITTED 5u
+#define SAMPLED_US (2u * BOARD_SAMPLE_US) /* until the board has noticed what an input shows */
+/* gauge_fitted, gauge_timeout_ms, gauge_frozen_ms, interlocks_fitted */
+static const uint32_t PROTECTION[] = {1u, GAUGE_TIMEOUT_MS, 1000u, INTERLOCKS_FITTED};
+static uint32_t interlocks; /* closed circuits */
+static bool gauge_absent;
+static uint32_t gauge_seen_us;
 
 static void put_word(uint32_t index, uint32_t value)
 {
@@ -53,7 +63,10 @@ static void make_record(void)
     for (uint32_t i = 0u; i < 30u; i++) {
         put_word(8u + i, scale[i % 6u]);
     }
-    put_word(38u, settings_crc32(record, SETTINGS_BYTES - 4u));
+    for (uint32_t i = 0u; i < 4u; i++) {
+        put_word(38u + i, PROTECTION[i]);
+    }
+    put_word(42u, settings_crc32(record, SETTINGS_BYTES - 4u));
 }
 
 /* A network of one connection whose bytes are those of the input. */
@@ -175,14 +188,28 @@ static void step(const uint8_t **data, size_t *size)
     } else if (what < 0xE0u) { /* the sensors */
         const size_t count = take(data, size, 4u);
         virtual_set_input(what % HAL_INPUT_CHANNELS, count == 4u ? (int32_t)(crc16(at, 4u) * 20u) : HAL_NO_VALUE);
+        if (what % HAL_INPUT_CHANNELS == HAL_GAUGE_PRESSURE) {
+            gauge_seen_us = gauge_absent ? gauge_seen_us : hal_micros();
+            gauge_absent = count != 4u;
+        }
         for (size_t i = 0u; i < count; i++) {
             (void)bench_take(&line, at[i]);
         }
     } else if (what < 0xF0u) {
         virtual_pass(1000u * (what & 0xFu) * (what & 0xFu), true, true);
-    } else {
+    } else if (what < 0xF8u) {
         virtual_hear_damage();
+    } else {
+        interlocks = what & 7u;
+        virtual_set_interlocks(interlocks);
+        virtual_pass(SAMPLED_US, true, true);
     }
+}
+
+static bool may_pump(void)
+{
+    const bool gauge = !gauge_absent || hal_micros() - gauge_seen_us <= 1000u * GAUGE_TIMEOUT_MS + SAMPLED_US;
+    return gauge && (INTERLOCKS_FITTED & ~interlocks) == 0u;
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
@@ -192,10 +219,14 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     tcp_start();
     virtual_power_on(record, sizeof record);
     virtual_set_input(HAL_GAUGE_PRESSURE, 0);
+    interlocks = 7u;
+    virtual_set_interlocks(interlocks);
+    gauge_absent = false;
     for (unsigned int i = 0u; size > 0u && i < STEPS_MAX; i++) {
         step(&data, &size);
         const bool driven = virtual_pump() > 0u;
-        if (virtual_pump() > 50000u || virtual_vent() > 50000u || (driven && virtual_resets() > 0u)) {
+        if (virtual_pump() > 50000u || virtual_vent() > 50000u || (driven && virtual_resets() > 0u) ||
+            (driven && !may_pump())) {
             abort();
         }
     }

@@ -122,6 +122,7 @@ static struct {
     int connection; /* to the film; -1 without one */
     uint64_t heard_us, said_us;
     uint32_t pump, vent;
+    bool wired; /* to a film, even if its connection is lost by now */
     struct bench_line line;
 } film = {.connection = -1};
 
@@ -133,6 +134,17 @@ static void film_connect(const char *port)
         fcntl(film.connection, F_SETFL, O_NONBLOCK) < 0) {
         give_up("no film on this port");
     }
+    film.wired = true;
+}
+
+/* Without a film the board sits on a bench: flat film, still air, every interlock closed. */
+static void bench_at_rest(void)
+{
+    static const int32_t RAWS[HAL_INPUT_CHANNELS] = {0, 0, 101325000, 210000, 210000, 0};
+    for (int channel = 0; channel < HAL_INPUT_CHANNELS; channel++) {
+        virtual_set_input(channel, RAWS[channel]);
+    }
+    virtual_set_interlocks(0xFFFFu);
 }
 
 static void film_hear(uint64_t now_us)
@@ -142,12 +154,14 @@ static void film_hear(uint64_t now_us)
     for (ssize_t i = 0; i < got; i++) {
         if (bench_take(&film.line, bytes[i])) {
             film.heard_us = now_us;
+            virtual_set_interlocks((uint32_t)film.line.numbers[BENCH_INTERLOCKS]);
             for (int channel = 0; channel < HAL_INPUT_CHANNELS; channel++) {
                 virtual_set_input(channel, (int32_t)film.line.numbers[channel]);
             }
         }
     }
-    if (now_us - film.heard_us > BENCH_STALE_US) {
+    if (film.wired && now_us - film.heard_us > BENCH_STALE_US) {
+        virtual_set_interlocks(0u);
         for (int channel = 0; channel < HAL_INPUT_CHANNELS; channel++) {
             virtual_set_input(channel, HAL_NO_VALUE);
         }
@@ -217,6 +231,9 @@ int main(int count, char **arguments)
     const int line = open_line(name, sizeof name);
     tcp_start();
     virtual_power_on(record, length);
+    if (!film.wired) {
+        bench_at_rest();
+    }
     printf("rtu %s tcp %u\n", name, port);
     fflush(stdout);
     run(line);

@@ -15,6 +15,7 @@ static struct {
     uint32_t tick_in_us;
     uint32_t fed_us; /* the hardware watchdog */
     int32_t inputs[HAL_INPUT_CHANNELS];
+    uint32_t interlocks;
     uint32_t pump, vent, resets;
     bool resetting;
     int heard[LINE_MAX];
@@ -52,6 +53,11 @@ uint32_t hal_micros(void)
 int32_t hal_input(enum hal_input_channel channel)
 {
     return chip.inputs[channel];
+}
+
+uint32_t hal_interlocks(void)
+{
+    return chip.interlocks;
 }
 
 void hal_outputs(uint32_t pump, uint32_t vent)
@@ -148,6 +154,11 @@ void virtual_set_input(int channel, int32_t raw)
     if (channel >= 0 && channel < HAL_INPUT_CHANNELS) {
         chip.inputs[channel] = raw;
     }
+}
+
+void virtual_set_interlocks(uint32_t closed)
+{
+    chip.interlocks = closed;
 }
 
 uint32_t virtual_pump(void)

@@ -17,6 +17,7 @@ void virtual_pass(uint32_t time_us, bool interrupts, bool main_loop);
 void virtual_skip(uint32_t time_us);
 
 void virtual_set_input(int channel, int32_t raw);
+void virtual_set_interlocks(uint32_t closed); /* all open at power-on */
 uint32_t virtual_pump(void);
 uint32_t virtual_vent(void);
 uint32_t virtual_resets(void); /* since power-on */

@@ -51,6 +51,7 @@ static struct ring sending, film_sending;
 static struct {
     struct bench_line line;
     int32_t inputs[HAL_INPUT_CHANNELS];
+    uint32_t interlocks;
     uint32_t heard_us;
     uint32_t said_us;
     uint32_t pump, vent;
@@ -109,11 +110,20 @@ uint32_t hal_micros(void)
     return FPGAIO_COUNTER;
 }
 
+static bool film_fresh(void)
+{
+    film.heard = film.heard && ((hal_micros() - film.heard_us) <= BENCH_STALE_US);
+    return film.heard;
+}
+
 int32_t hal_input(enum hal_input_channel channel)
 {
-    const bool fresh = film.heard && ((hal_micros() - film.heard_us) <= BENCH_STALE_US);
-    film.heard = fresh;
-    return fresh ? film.inputs[channel] : HAL_NO_VALUE;
+    return film_fresh() ? film.inputs[channel] : HAL_NO_VALUE;
+}
+
+uint32_t hal_interlocks(void)
+{
+    return film_fresh() ? film.interlocks : 0u;
 }
 
 void hal_outputs(uint32_t pump, uint32_t vent)
@@ -161,6 +171,7 @@ static void film_line(void)
     for (uint32_t i = 0u; i < (uint32_t)HAL_INPUT_CHANNELS; i++) {
         film.inputs[i] = (int32_t)film.line.numbers[i];
     }
+    film.interlocks = (uint32_t)film.line.numbers[BENCH_INTERLOCKS];
     film.heard_us = hal_micros();
     film.heard = true;
     hal_unlock(before);

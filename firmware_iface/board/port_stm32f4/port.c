@@ -5,8 +5,8 @@
 #include "settings.h"
 #include "stm32f4.h"
 
-/* Pins. Port A: 0, 1, 4 analog; 2, 3 Modbus; 6 pump; 7 vent; 8 RS-485 driver; 10 laser. Port B: 0 analog; 5 enable.
- * Port C: 0 analog. */
+/* Pins. Port A: 0, 1, 4 analog; 2, 3 Modbus; 6 pump; 7 vent; 8 RS-485 driver; 10 laser. Port B: 0 analog; 5 enable;
+ * 6, 8, 9, 10 interlock inputs 0..3, high while their circuit is closed. Port C: 0 analog. */
 #define PUMP_VENT_PINS 0x00C0u
 #define DRIVER_PIN 0x0100u
 #define ENABLE_PIN 0x0020u
@@ -71,8 +71,9 @@ static void start_outputs(void)
     GPIOA->afrl = 0x22007700u;  /* 7, 6: TIM3; 3, 2: USART2 */
     GPIOA->afrh = 0x00000700u;  /* 10: USART1 */
     GPIOA->pupdr = 0x64100040u; /* pull-ups on both receivers: an open line is idle */
+    GPIOB->pupdr = 0x002A2100u; /* pull-downs on 6, 8, 9, 10: a cut wire is open; 4 as at reset */
     GPIOA->moder = 0xA821A3AFu; /* 0, 1, 4 analog; 2, 3, 6, 7, 10 alternate; 8 output */
-    GPIOB->moder = 0x00000683u; /* 0 analog; 5 output */
+    GPIOB->moder = 0x00000683u; /* 0 analog; 5 output; 6, 8, 9, 10 input */
     GPIOC->moder = 0x00000003u;
 }
 
@@ -142,6 +143,17 @@ int32_t hal_input(enum hal_input_channel channel)
     }
 #endif
     return found;
+}
+
+uint32_t hal_interlocks(void)
+{
+    static const uint32_t PINS[] = {6u, 8u, 9u, 10u};
+    const uint32_t levels = GPIOB->idr;
+    uint32_t closed = 0u;
+    for (uint32_t i = 0u; i < (sizeof(PINS) / sizeof(PINS[0])); i++) {
+        closed |= ((levels >> PINS[i]) & 1u) << i;
+    }
+    return closed;
 }
 
 /* PWM, and a square wave of 500 Hz on the enable, which lives on by its edges alone. */
