@@ -93,7 +93,8 @@ def fleet_line(status: dict[str, Any]) -> str:
     if "problem" in status:
         return f"{'no contact':10}{'':14}{status['problem']}"
     row, fault = status.get("row") or {}, status.get("fault")
-    notices = [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    parts = ("interlocks", "maintenance", "recording")
+    notices = [str(each) for part in parts for each in status.get(part, {}).values()]
     words = [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
     words += notices or [str(status.get("why") or "as it should be")]
     return f"{status['state']:10}{_shown(row.get('error_um'))} um {'; '.join(words)}"
@@ -105,6 +106,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
     lines = [f"{status.get('run', '?')}: {status['state']} - {status['why'] or 'as it should be'}"]
     if fault:
         lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
+    lines += [f"OPEN {message}" for message in status.get("interlocks", {}).values()]
     if row:
         shown = {
             "setpoint": ("setpoint_um", "um"),

@@ -17,6 +17,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5
+_NO_VENT = "no vent is fitted, the leak lowers the mirror"
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
 # A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded off, report that
 # the pump still runs. Shorter than the 30 s that the service manager allows.
@@ -172,8 +173,9 @@ def lower(scene: Scene) -> State:
     if scene.venting:
         reading = scene.observer.reading
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
-        scene.why = f"venting: {pressure_pa:.0f} Pa left"
-        if scene.state_age_s > _VENTED_S:
+        vented = scene.config.vent_fitted
+        scene.why = f"{'venting' if vented else _NO_VENT}: {pressure_pa:.0f} Pa left"
+        if vented and scene.state_age_s > _VENTED_S:
             scene.why += f" after {scene.state_age_s / 60:.0f} min: check the vent and the gauge"
         if not pressure_pa < scene.config.states.vented_pressure_pa:
             return State.LOWER
@@ -186,7 +188,7 @@ def lower(scene: Scene) -> State:
 def fault(scene: Scene) -> State:
     """Descend the safe levels, latched; a person clears the fault, or the resume rule once its cause has gone."""
     safe_level = scene.levels.step(scene.now_s)
-    scene.why = f"fault: {safe_level.name.lower().replace('_', ' ')}"
+    scene.why = f"fault: {_level_words(safe_level, scene)}"
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting or safe_level == SafeLevel.VENT)
     if safe_level == SafeLevel.RAMP_DOWN:
@@ -209,6 +211,13 @@ def fault(scene: Scene) -> State:
     if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, safe_level)):
         scene.finished = Exit.SAFETY_TRIP
     return State.FAULT
+
+
+def _level_words(safe_level: SafeLevel, scene: Scene) -> str:
+    """The safe level for people, by what the bench can do."""
+    if safe_level == SafeLevel.VENT and not scene.config.vent_fitted:
+        return f"pump off; {_NO_VENT}"
+    return safe_level.name.lower().replace("_", " ")
 
 
 def _nothing_left_to_do(scene: Scene, safe_level: SafeLevel) -> bool:

@@ -126,6 +126,7 @@ STREAMS: tuple[Stream, ...] = (
             Line("shape_state", "shape state", VIOLET),
             Line("safe_level", "safe level", YELLOW),
             Line("fault", "fault", RED),
+            Line("interlocks_open", "open interlocks, a bit each", WHITE),
         ),
     ),
 )

@@ -44,10 +44,11 @@ def tell(text: str, good: bool | None = None) -> None:
 
 
 def alarms_of(status: Mapping[str, Any]) -> str:
-    """The fault, the maintenance notices and what the recording lacks, in one line."""
+    """The fault, the open interlocks, the maintenance notices and what the recording lacks, in one line."""
     fault = status.get("fault")
     lines = [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
-    lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    parts = ("interlocks", "maintenance", "recording")
+    lines += [str(each) for part in parts for each in status.get(part, {}).values()]
     return "; ".join(lines)
 
 
