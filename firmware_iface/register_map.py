@@ -144,6 +144,10 @@ class RegisterMap:
         """The bit of the fault of that name, as a number. Raises KeyError."""
         return {fault.name: fault.mask for fault in self.faults}[name]
 
+    def fault_since(self, name: str) -> int:
+        """The first map version whose boards latch the fault of that name. Raises KeyError."""
+        return {fault.name: fault.since for fault in self.faults}[name]
+
     def of_version(self, version: int) -> "RegisterMap":
         """The map of boards of an earlier version. Raises RegisterMapError for an unknown version."""
         if not 1 <= version <= self.map_version:

@@ -15,7 +15,6 @@ NO_CLAIM = (
     "this board has no claim (register map 1): any program that reaches it can run its pump, and two programs on two "
     "machines are not kept apart; update its firmware"
 )
-NO_GAUGE_GUARD = "this board's firmware does not stop the pump when its gauge fails"
 _HEARTBEATS = 2**16
 _U32_MAX = 2**32 - 1
 # refused writes in a row until a claim counts as lost although its name is still there: one may be a gateway's answer

@@ -63,7 +63,7 @@ def list_places(devices: "DevicesConfig", name_link: Callable[[str], Hashable]) 
                 for address in _BRONKHORST_REGISTERS:
                     yield DevicePlace(f"{key}.unit_id", (device, "holding", address), f"register {address} of {unit}")
     for index, interlock in enumerate(devices.interlocks):
-        yield _circuit(f"devices.interlocks.{index}", interlock, name_link)
+        yield circuit_place(f"devices.interlocks.{index}", interlock, name_link)
 
 
 def _registers(
@@ -90,7 +90,8 @@ def _preset(name: str) -> dict[str, Any]:
         return {}
 
 
-def _circuit(key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]) -> DevicePlace:
+def circuit_place(key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]) -> DevicePlace:
+    """The place of an interlock's circuit; `key` is that of its table."""
     match interlock:
         case settings.BoardInputConfig():
             words = f"input {interlock.input} of the pump board"

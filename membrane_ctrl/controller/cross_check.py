@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
@@ -26,6 +27,8 @@ _UNATTENDED_S, _BLIND_S = 2.0, 60.0
 _PAUSE_S = 3600.0  # the laser still guards the limits, but no loop holds the mirror
 _PUMP_STANDS_S = 0.5  # lag and transport
 _GAUGE_NOISE_PA = 1.0
+_PRESSURE_MISSING = next(rule for rule in safety.TABLE if rule.name == "pressure_missing")
+_GUARDED_SINCE = default_map().fault_since("gauge_lost")
 _UNKNOWN = BenchIdentity("", 0, "", math.nan)
 _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # the device of `--twin` if none are named
 
@@ -37,7 +40,12 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
     if not say.found:  # the others compute with the values
         for judge in _RULES:
             judge(config, say)
-        for judge_board in (cross_check_plant.judge_ranges, cross_check_interlocks.judge_interlock_board, _board):
+        for judge_board in (
+            cross_check_plant.judge_ranges,
+            cross_check_interlocks.judge_interlock_board,
+            _board,
+            _board_guards,
+        ):
             judge_board(config, board or _UNKNOWN, say)
     return tuple(sorted(say.found, key=lambda finding: finding.severity))
 
@@ -214,6 +222,22 @@ def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFi
     refused = config.states.actuator_test and test > limit + 1e-9
     remedy = "raise the board's limit, or omit the test"
     say.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)
+
+
+def _board_guards(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
+    """Check whether the board itself protects the mirror when its gauge fails."""
+    if config.devices is None or config.devices.board is None or board.map_version == 0:
+        return
+    guarded = board.map_version >= _GUARDED_SINCE
+    why = "this board's firmware does not stop the pump when its gauge fails"
+    say.warn(not guarded, "devices.board", why, f"update to map version {_GUARDED_SINCE}")
+    why = "no gauge is fitted according to the board's settings, so it has no over-pressure protection of its own"
+    say.warn(guarded and not board.gauge_fitted, "devices.board", why, "store gauge_fitted = true in the board")
+    noticed_s = _PRESSURE_MISSING.window / config.loop.rate_hz
+    ramp_s = noticed_s + config.states.ramp_down_s
+    cut = guarded and board.gauge_fitted and ramp_s >= board.gauge_timeout_s
+    why = f"the board itself stops the pump and latches {board.gauge_timeout_s:g} s after its gauge fails"
+    say.warn(cut, "states.ramp_down_s", why, "shorten it, or lengthen gauge_timeout_s in the board")
 
 
 _RULES = (

@@ -72,7 +72,7 @@ async def rig(
 async def test_it_conforms(rig: _Rig) -> None:
     findings = await examine(rig.board.url, timeout_s=2.0)
     assert [(found.check, found.problem) for found in findings if found.problem] == []
-    assert len(findings) == 21
+    assert len(findings) == 22
 
 
 async def test_sensors_arrive_and_outputs_leave(rig: _Rig) -> None:

@@ -58,6 +58,7 @@ class Twins:
             self.python.advance(self.python_ms / 1e3, self._sampled)
 
     def change_sensors(self, good: bool = False) -> None:
+        self._follow(self.c.now_us)  # with the former values
         wide = [self.chance.randint(-(2**31) + 1, 2**31 - 1) for _ in range(5)]
         self.raws = [NO_VALUE if self.chance.random() < 0.2 else raw for raw in wide]
         self.raws[1] = self.chance.choice([NO_VALUE, 0, -5_000, 799_999, 800_000, 800_001, 2_000_000, 100, 200])
@@ -65,7 +66,6 @@ class Twins:
         self.interlocks = self.chance.choice([0xFFFF] * 8 + [0b101, 0b001, 0b100])
         if good:
             self.raws[1], self.interlocks = self.chance.randrange(100, 1000), 0xFFFF
-        self._follow(self.c.now_us)
         self._wire()
         self.c.pass_us(10_000)
 

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +201,37 @@ def test_the_boards_own_limits_are_the_last_word() -> None:
         {"limits.gauge_pressure_max_pa": 700.0, "loop.flow_max_um_per_s": 3.5, "states.actuator_test": False}
     )
     assert cross_check(weaker, strict) == ()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_board_that_does_not_guard_its_gauge_is_a_warning(version: int) -> None:
+    old = BenchIdentity("board", version, "1.0.0", 0.5, 800.0, 1.0)
+    (finding,) = cross_check(config_of({}, BOARD), old)
+    assert finding.line("lab.toml") == (
+        "lab.toml: warning: devices.board = tcp://127.0.0.1:1: this board's firmware does not stop the pump when its "
+        "gauge fails; update to map version 3"
+    )
+
+
+def test_a_board_without_a_gauge_is_a_warning() -> None:
+    guarded = BenchIdentity("board", 3, "1.1.0", 0.5, 800.0, 1.0, gauge_timeout_s=15.0)
+    assert cross_check(config_of({}, BOARD), guarded) == ()
+    (finding,) = cross_check(config_of({}, BOARD), replace(guarded, gauge_fitted=False))
+    assert (finding.severity, finding.field) == ("warning", "devices.board")
+    assert "no over-pressure protection of its own" in finding.why
+
+
+def test_a_ramp_that_the_board_cuts_off_is_a_warning() -> None:
+    """The rule needs ten ticks of 20 ms to notice a missing gauge."""
+    board = BenchIdentity("board", 3, "1.1.0", 0.5, 800.0, 1.0, gauge_timeout_s=10.3)
+    assert severity_of(config_of({}, BOARD), "states.ramp_down_s", board) == ""
+    board = replace(board, gauge_timeout_s=10.1)
+    assert severity_of(config_of({}, BOARD), "states.ramp_down_s", board) == "warning"
+    assert severity_of(config_of({}, BOARD), "states.ramp_down_s", replace(board, gauge_fitted=False)) == ""
+
+
+def test_single_instruments_have_no_board_to_warn_of() -> None:
+    assert cross_check(config_of({}, ROLES), BenchIdentity("composed", 0, "", 0.5)) == ()
 
 
 @pytest.mark.parametrize("room", [("loop.setpoint_um", 450.0), ("loop.setpoint_um", -1950.0)])
