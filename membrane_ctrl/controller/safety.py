@@ -166,10 +166,10 @@ TABLE: tuple[Rule, ...] = (
         remedy="ask the person who locked it whether the mirror may move",
         seen=lambda o: o.locked, broken=lambda o, c: bool(o.locked),
     ),
-    Rule(  # 1 of 1: an opened circuit is a demand to stop; who must ride out a bouncing contact filters it outside
+    Rule(  # 1 of 1: an open circuit is a demand to stop. A bouncing contact is to be filtered in its own hardware
         code=60, name="interlock_open", cause="the circuit of an interlock is open, or its signal is lost",
         limit="devices.interlocks", safe_level=SafeLevel.RAMP_DOWN, states=GAS_MOVES | {State.FAULT},
-        remedy="do what its text says; it closes by itself or by hand, then acknowledge the fault",
+        remedy="follow the interlock's text, close its circuit, then acknowledge the fault",
         seen=lambda o: o.interlock_words, broken=lambda o, c: o.open_interlocks != 0,
         deepens=lambda o: o.interlock_level, enters="its own: ramp_down, pump_off or vent",
     ),
