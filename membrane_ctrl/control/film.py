@@ -21,8 +21,17 @@ SMOOTH_S = 10.0
 _KNOWN_S, _KNOWN_READINGS, WARM_S = 5.0, 50, 3 * SMOOTH_S
 # Creep of 10 um/min is 20 um ahead of this reference; the 2 um/min of a mount that warms up are 4 um.
 SINCE_MINUTES_S = 120.0
-# Creep of 17 um/h is 100 um ahead; a fresh film's own (1 % of compliance in a day) is 31 um.
-SINCE_HOURS_S = 6 * 3600.0
+# Climate moves the gauge against laser and optics: a day of +-10 % relative humidity by +-235 um, of +-2 K by +-41 um
+# of the gauge's zero (1 Pa/K) and +-114 um of a film that follows the air before its ring does. All of it in phase,
+# +-390 um, is 99 um ahead of a reference of an hour. A drift must be faster than 0.033 um/s to reach 120 um there.
+SINCE_HOUR_S = 3600.0
+# That climate is up to 624 um ahead of this reference (from the day's highest to its lowest); so is any drift faster
+# than 29 um/h, which therefore ends at 700 um and somewhat more.
+SINCE_DAY_S = 86_400.0
+# Of the limit within a day: the climate of a controlled laboratory (+-1 K, +-5 %, 220 um) stays below it.
+DRIFTING_SHARE = 1 / 3
+# A notice ends only when the two are clearly nearer again.
+DRIFTING_OVER_SHARE = 0.8 * DRIFTING_SHARE
 # Of the limit within minutes: gusts, doors and setpoints use 0.17 of it in hours, 0.1 K of the gauge 0.1 more
 _DOUBTED_SHARE = 0.35
 # On a long way the sag's own uncertainty matters (pre-strain, an offset of the laser's zero).
@@ -54,6 +63,7 @@ def _known(seen_s: float, readings: int) -> bool:
 class _Since:
     """Changes of sag against a reference that follows slowly while laser and gauge agree."""
 
+    sensor: str  # of the displacement
     follow_s: float
     limit_um: float
     laser_um: float = math.nan
@@ -71,7 +81,7 @@ class _Since:
         apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
         self.share = apart_um / (self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)))
         if self.share > 1.0:
-            return f"laser {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
+            return f"{self.sensor} {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
         share = smoothing(dt_s, self.follow_s)
         self.laser_um += share * by_laser_um
         self.trim_um += share * trimmed_um
@@ -127,21 +137,35 @@ class LeakGrowth:
 
 
 class FilmMonitor:
-    """Compares laser and gauge on every tick in which the pump may run."""
+    """Compares one displacement, by the laser or by the optics, with the gauge on every tick with a driven pump.
 
-    def __init__(self, limits: LimitsConfig, mirror: MirrorConfig) -> None:
+    Parameters
+    ----------
+    limits : LimitsConfig
+    mirror : MirrorConfig
+    sensor : str
+        The displacement's sensor, for the message.
+
+    Attributes
+    ----------
+    drifting : bool
+        Sensor and gauge have moved apart over hours, as by climate or a slow drift.
+    """
+
+    def __init__(self, limits: LimitsConfig, mirror: MirrorConfig, sensor: str = "laser") -> None:
+        self._sensor = sensor
         self._limits = limits
         self._sag_um, self._pressure_pa = 1e3 * mirror.sag_mm, mirror.pressure_pa
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
+        self.drifting = False
         self._laser, self._trim, self._root = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
         self._seen_s, self._readings = 0.0, 0
-        self._since = (
-            _Since(SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um),
-            _Since(SINCE_HOURS_S, self._limits.laser_gauge_drift_max_um),
-        )
+        self._minutes = _Since(self._sensor, SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um)
+        self._hour = _Since(self._sensor, SINCE_HOUR_S, self._limits.laser_gauge_drift_max_um)
+        self._day = _Since(self._sensor, SINCE_DAY_S, self._limits.laser_gauge_day_max_um)
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
         """Process one tick and return both readings if they contradict each other. NaN without a good reading.
@@ -161,20 +185,26 @@ class FilmMonitor:
         sag_um = self._sag_um + laser_um
         if not _known(self._seen_s, self._readings) or not (self._taut or root**3 > TAUT_PA):
             return ""
-        minutes, hours = self._since
-        return minutes.apart(laser_um, trim_um, root, sag_um, dt_s) or hours.apart(
-            laser_um, trim_um, root, sag_um, dt_s
-        )
+        contradictions = [
+            since.apart(laser_um, trim_um, root, sag_um, dt_s) for since in (self._minutes, self._hour, self._day)
+        ]
+        self.drifting = self._day.share > (DRIFTING_OVER_SHARE if self.drifting else DRIFTING_SHARE)
+        return next(filter(None, contradictions), "")
 
     @property
     def doubted(self) -> bool:
         """Laser and gauge are further apart than by noise or drift, though within the limit."""
-        return self._since[0].share > _DOUBTED_SHARE
+        return self._minutes.share > _DOUBTED_SHARE
+
+    @property
+    def drift_um(self) -> float:
+        """How far sensor and gauge have moved apart within a day, um; 0 without a reference."""
+        return self._day.share * self._limits.laser_gauge_day_max_um
 
     @property
     def _taut(self) -> bool:
         """There is a reference: from now on, a gauge that falls to zero does not mean a slack film."""
-        return math.isfinite(self._since[0].root)
+        return math.isfinite(self._minutes.root)
 
     def _not_nominal(self, laser_um: float, gauge_pa: float) -> str:
         if self._pressure_pa == 0.0 or self._seen_s < NOMINAL_S:
@@ -196,8 +226,16 @@ class FilmMonitor:
 
 # A laser's mount at 2 um/min is then 4 um ahead of its reference: less than the limit of 10 um.
 REFERENCE_S = 120.0
+# The second reference finds optics that drift by 0.034 um/s or more: 20 um ahead of it. Climate moves the gauge by at
+# most 0.028 um/s (see SINCE_HOUR_S), 17 um ahead of it; in the usual phase 13 um, less than the 2/3 of 20 um with
+# which a gauge that climate moves would side with the wrong one.
+SLOW_REFERENCE_S = 600.0
+# Of the limit between laser and optics.
+SLOW_SHARE = 2.0
 # The gauge must be nearer to one of them by this factor to speak.
 CLEARER = 2.0
+# A laser without a reading for this long is not compared; its mean then begins with its next reading.
+LASER_GAP_S = 2.0
 
 
 class Liar(IntEnum):
@@ -221,12 +259,54 @@ class Changes:
         """Format the changes as one line."""
         return f"laser {self.laser_um:+.1f} um, camera {self.optics_um:+.1f} um, gauge {self.gauge_um:+.1f} um"
 
+    def judge(self) -> Liar:
+        """Which of laser and optics the gauge contradicts: it must be clearly nearer to the other one."""
+        to_laser_um, to_optics_um = abs(self.gauge_um - self.laser_um), abs(self.gauge_um - self.optics_um)
+        if to_optics_um * CLEARER < to_laser_um:
+            return Liar.LASER
+        if to_laser_um * CLEARER < to_optics_um:
+            return Liar.OPTICS
+        return Liar.UNSURE
+
+
+@dataclass(slots=True)
+class _Reference:
+    """Means of laser, optics and gauge that follow the present ones while laser and optics agree."""
+
+    follow_s: float
+    limit_um: float
+    laser_um: float = math.nan
+    optics_um: float = math.nan
+    gauge_pa: float = math.nan
+
+    @property
+    def known(self) -> bool:
+        """Whether there is one."""
+        return math.isfinite(self.laser_um)
+
+    def begin(self, means: tuple[float, float, float]) -> None:
+        """Place it at the present means of laser (um), optics (um) and gauge (Pa)."""
+        self.laser_um, self.optics_um, self.gauge_pa = means
+
+    def follow(self, means: tuple[float, float, float], dt_s: float) -> None:
+        """Move it towards the present means."""
+        share = smoothing(dt_s, self.follow_s)
+        self.laser_um += share * (means[0] - self.laser_um)
+        self.optics_um += share * (means[1] - self.optics_um)
+        self.gauge_pa += share * (means[2] - self.gauge_pa)
+
+    def changes(self, means: tuple[float, float, float]) -> Changes:
+        """Changes of sag since the reference."""
+        um_per_pa = means[1] / (3 * means[2])
+        return Changes(means[0] - self.laser_um, means[1] - self.optics_um, um_per_pa * (means[2] - self.gauge_pa))
+
 
 class PlausibilityCheck:
     """Judges on every tick; NOBODY without a camera, as two sensors can only disagree.
 
-    Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`). `changes` are NaN until there is a
-    reference.
+    Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`) within minutes, and `SLOW_SHARE` times as
+    much within a quarter of an hour; there only the camera is found wrong, for a laser's mount that drifts so slowly
+    is what the camera corrects. `changes` are NaN until there is a reference.
     """
 
     def __init__(self, limit_um: float) -> None:
@@ -236,9 +316,12 @@ class PlausibilityCheck:
     def reset(self) -> None:
         """Forget everything: the mirror is not held."""
         self._laser, self._gauge, self._optics = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
-        self._reference: tuple[float, float, float] | None = None
+        self._fast = _Reference(REFERENCE_S, self._limit_um)
+        self._slow = _Reference(SLOW_REFERENCE_S, SLOW_SHARE * self._limit_um)
         self._age_s, self._readings = 0.0, 0
-        self._seen_s = math.nan
+        self._figure_s = math.nan
+        self._laser_gap_s = 0.0
+        self._slow_wrong = False  # the verdict is the slow reference's
         self.liar = Liar.NOBODY
         self.changes = Changes(math.nan, math.nan, math.nan)
 
@@ -250,7 +333,12 @@ class PlausibilityCheck:
     @property
     def judges(self) -> bool:
         """Whether it would tell a moved laser from a moved film."""
-        return self._reference is not None
+        return self._fast.known
+
+    @property
+    def slow_wrong(self) -> bool:
+        """Whether the verdict is on a slow drift: what the sensor showed is wrong since a quarter of an hour."""
+        return self._slow_wrong
 
     def step(
         self,
@@ -264,41 +352,59 @@ class PlausibilityCheck:
 
         `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
         """
-        if math.isfinite(displacement_um):
-            self._laser.update(displacement_um, dt_s)
+        self._take_laser(displacement_um, dt_s)
         if math.isfinite(gauge_pa):
             self._gauge.update(gauge_pa, dt_s)
         if estimate is not None and estimate.verdict != "rejected" and math.isfinite(estimate.sag_um):
-            since_s = 0.0 if math.isnan(self._seen_s) else estimate.time_s - self._seen_s
+            since_s = 0.0 if math.isnan(self._figure_s) else estimate.time_s - self._figure_s
             self._optics.update(estimate.sag_um, max(since_s, 0.0))
-            self._seen_s = estimate.time_s
+            self._figure_s = estimate.time_s
         means = (self._laser.value, self._optics.value, self._gauge.value)
-        if not blind and all(map(math.isfinite, means)):
+        laser_present = self._laser_gap_s <= LASER_GAP_S
+        if laser_present and not blind and all(map(math.isfinite, means)):
             self._age_s, self._readings = self._age_s + dt_s, self._readings + 1
             self._judge(means, dt_s)
         return self.liar
 
+    def _take_laser(self, displacement_um: float, dt_s: float) -> None:
+        """Update the laser's mean; after a gap it begins with the first reading, for the film may have moved."""
+        if not math.isfinite(displacement_um):
+            self._laser_gap_s += dt_s
+            return
+        if self._laser_gap_s > LASER_GAP_S:
+            self._laser = LowPass(SMOOTH_S, early_mean=True)
+        self._laser_gap_s = 0.0
+        self._laser.update(displacement_um, dt_s)
+
     def _judge(self, means: tuple[float, float, float], dt_s: float) -> None:
         if not _known(self._age_s, self._readings):
             return
-        if self._reference is None:
-            self._reference = means
-        laser, optics, gauge = (mean - reference for mean, reference in zip(means, self._reference, strict=True))
-        um_per_pa = self._optics.value / (3 * self._gauge.value)
-        self.changes = Changes(laser, optics, um_per_pa * gauge)
-        limit_um = self._limit_um if self.liar == Liar.NOBODY else self._limit_um / 2  # and back only when clearly so
-        if abs(laser - optics) <= limit_um:
-            self.liar = Liar.NOBODY
-            follow = smoothing(dt_s, REFERENCE_S)
-            a, b, c = (was + follow * (mean - was) for was, mean in zip(self._reference, means, strict=True))
-            self._reference = a, b, c
-            return
+        for reference in (self._fast, self._slow):
+            if not reference.known:
+                reference.begin(means)
         if self.liar in (Liar.LASER, Liar.OPTICS):
-            return  # the verdict stands until the two agree again: a drifting gauge must not accuse the other
-        to_laser_um, to_optics_um = abs(self.changes.gauge_um - laser), abs(self.changes.gauge_um - optics)
-        if to_optics_um * CLEARER < to_laser_um:
-            self.liar = Liar.LASER
-        elif to_laser_um * CLEARER < to_optics_um:
-            self.liar = Liar.OPTICS
+            # The verdict stands until the two clearly agree again: a drifting gauge must not accuse the other.
+            judged = self._slow if self._slow_wrong else self._fast
+            self.changes = changes = judged.changes(means)
+            if abs(changes.laser_um - changes.optics_um) <= judged.limit_um / 2:
+                self.liar, self._slow_wrong = Liar.NOBODY, False
         else:
-            self.liar = Liar.UNSURE
+            self._judge_fast(means)
+            if self.liar == Liar.NOBODY:
+                self._judge_slowly(means)
+        if self.liar == Liar.NOBODY:
+            self._fast.follow(means, dt_s)
+            self._slow.follow(means, dt_s)
+
+    def _judge_fast(self, means: tuple[float, float, float]) -> None:
+        self.changes = changes = self._fast.changes(means)
+        limit_um = self._limit_um if self.liar == Liar.NOBODY else self._limit_um / 2  # and back only when clearly so
+        agree = abs(changes.laser_um - changes.optics_um) <= limit_um
+        self.liar = Liar.NOBODY if agree else changes.judge()
+
+    def _judge_slowly(self, means: tuple[float, float, float]) -> None:
+        """Find a camera that drifts slowly; a laser's slow drift is its mount's, and is corrected."""
+        changes = self._slow.changes(means)
+        apart = abs(changes.laser_um - changes.optics_um) > self._slow.limit_um
+        if apart and changes.judge() == Liar.OPTICS:
+            self.liar, self.changes, self._slow_wrong = Liar.OPTICS, changes, True

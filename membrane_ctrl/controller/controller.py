@@ -101,8 +101,8 @@ class Controller:
             locked=scene.latched,
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            optics_hold=self._config.by_optics or self._holders.optics_hold,
-            estimated_um=last.filtered_um - scene.trim_um,
+            optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
+            displacement_valid=self._displacement_suffices(),
             open_interlocks=scene.interlocks.judged_mask,
             interlock_level=scene.interlocks.safe_level,
             interlock_words=scene.interlocks.describe_open(scene.interlocks.judged_mask),
@@ -133,6 +133,20 @@ class Controller:
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
         )
+
+    def _displacement_suffices(self) -> bool:
+        """Whether the displacement is known as well as the present state needs it.
+
+        A loop needs a new reading or figure, or the estimate while that follows the optics. A flow that a person has
+        set, and a pause, need only what their range is judged by. An experiment measures with the laser.
+        """
+        scene, observer = self._scene, self._scene.observer
+        if self.state == State.TUNE and not self._config.by_optics:
+            return math.isfinite(observer.laser_um) or self._holders.optics_hold
+        if self.state == State.MANUAL or scene.paused:
+            return math.isfinite(observer.guard_um)
+        estimated = self.state in (State.SETTLE, State.HOLD) and self._holders.optics_hold
+        return math.isfinite(observer.displacement_um) or estimated
 
     def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
         scene = self._scene

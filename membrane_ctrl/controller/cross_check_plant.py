@@ -20,9 +20,9 @@ _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
 # Figures a second to inflate by without a laser: the loop then has 0.3 s of delay and keeps its margins
 _TRACK_LEAST_HZ = 5.0
-# Differences between an honest laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
-# fresh film (control/film.py)
-_APART_UM, _CREEP_UM = 7.0, 31.0
+# Differences between a sound laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
+# fresh film within hours, and with a day of +-1 K and +-5 % of relative humidity (control/film.py)
+_APART_UM, _CREEP_UM, _CLIMATE_UM = 7.0, 31.0, 220.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,6 +259,8 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
         say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
         why = f"{by} alone reach it"
         say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} um")
+    why, least = "a day's temperature and humidity alone reach it", f"set at least {_CLIMATE_UM:g} um"
+    say.error(limits.laser_gauge_day_max_um < _CLIMATE_UM, "limits.laser_gauge_day_max_um", why, least)
 
 
 def judge_film(config: Config, say: ConfigFindings) -> None:

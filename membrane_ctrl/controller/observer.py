@@ -5,7 +5,8 @@ import math
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
-from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.controller.figure_gate import FigureGate
+from membrane_ctrl.controller.jumps import JumpGate
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
 
@@ -23,88 +24,6 @@ class _Repeats:
         return 0.0 if math.isnan(self._since_s) else now_s - self._since_s
 
 
-class _Jumps:
-    """Refuses values impossibly far from the last good one; accepts the new place after ten in a row.
-
-    By then the safety table has tripped, and the film may indeed have moved unseen.
-    """
-
-    def __init__(self, step_max: float) -> None:
-        self._step_max = step_max
-        self._good = math.nan
-        self.count = 0
-
-    def refuse(self, value: float) -> bool:
-        """Whether a value is a jump; NaN is not."""
-        if not math.isfinite(value):
-            return False
-        if abs(value - self._good) > self._step_max and self.count < 10:
-            self.count += 1
-            return True
-        self.count = 0
-        self._good = value
-        return False
-
-
-_FIGURE_S, _FIGURES = 1.0, 5  # a figure older than this, and than so many intervals, shows nothing
-_JUMPED = 5  # figures in a row that no film can show; one or two are bad figures
-_REPEATS = 3  # no two figures have the same noise
-_CAMERA_STARTS_S = 900.0  # compiling on a slow machine, and the self-test of screen and camera
-
-
-class _Figures:
-    """The centre as figures of the mirror show it: what a bench without a laser is held by.
-
-    Displacement 0 is a sag of `optics.mirror.sag_mm`. `missing` tells why there is no displacement, if so.
-    """
-
-    def __init__(self, config: Config) -> None:
-        self._zero_um = 1e3 * config.optics.mirror.sag_mm
-        self._fresh_s = max(_FIGURE_S, _FIGURES / config.shape.track_rate_hz)
-        self._jumps = _Jumps(config.limits.step_max_um)
-        self._um = self._time_s = self._first_s = math.nan
-        self._repeats = 0
-        self._refused = ""
-        self.waited_s = 0.0  # for the first figure
-        self.missing = ""
-
-    def look(self, now_s: float, figure: ShapeEstimate | None) -> float:
-        """Displacement in um by the newest figure; NaN if that is too old."""
-        if math.isnan(self._first_s):
-            self._first_s = now_s
-        if math.isnan(self._um):
-            self.waited_s = min(now_s - self._first_s, _CAMERA_STARTS_S)
-        if figure is not None:
-            self._take(figure, now_s)
-        age_s = now_s - self._time_s
-        self.missing = ""
-        if age_s <= self._fresh_s and self._repeats < _REPEATS and self._jumps.count < _JUMPED:
-            return self._um
-        if self._repeats >= _REPEATS:
-            self.missing = "the camera repeats one figure to the last bit"
-        elif math.isnan(age_s):
-            self.missing = f"no figure of the mirror yet{self._refused}"
-        else:
-            self.missing = f"no figure of the mirror for {age_s:.1f} s{self._refused}"
-        return math.nan
-
-    def _take(self, figure: ShapeEstimate, now_s: float) -> None:
-        um = figure.sag_um - self._zero_um
-        if figure.verdict == "rejected":
-            self._refused = f": {figure.reason}"
-        elif figure.kind == "full":
-            self._refused = ": it has only been anchored"  # which shows another sag than the frames after it
-        elif not math.isfinite(um):
-            self._refused = ": it is not finite"
-        elif not figure.time_s <= now_s or figure.time_s <= self._time_s:
-            self._refused = ": its time is wrong"
-        elif self._jumps.refuse(um):
-            self._refused = f": the sag jumped by {um - self._um:+.0f} um"
-        else:
-            self._repeats = self._repeats + 1 if um == self._um else 0
-            self._um, self._time_s, self._refused = um, figure.time_s, ""
-
-
 class Observer:
     """Detects stale, frozen and jumping input.
 
@@ -112,25 +31,40 @@ class Observer:
     ----------
     reading : BenchReading or None
         This tick's reading.
+    laser_um : float
+        The laser's reading, if it is new, of good quality and no jump; NaN without one, or on a bench that uses none.
     displacement_um : float
-        The displacement that the loop may use, by the laser, or by figures on a bench held without one; NaN without.
+        The displacement that the loop may use: the laser's, or that of the figures if the loop may follow the optics
+        and the laser has none; NaN without either.
+    guard_um : float
+        The displacement by which range and limits are judged: like `displacement_um`, with figures of a few seconds
+        ago as well.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
+    optics_replace_laser : bool
+        Those two are by figures: the laser is missing or stuck, or not used.
+    figures : FigureGate
+        The figures that may be used.
     commanded : tuple of float
         The last two pump commands, newest first.
     """
 
     def __init__(self, config: Config) -> None:
         limits = config.limits
-        self._figures: _Figures | None = _Figures(config) if config.by_optics else None
+        self._by_optics = config.by_optics
+        self._follows_optics = config.estimator.process_value != "laser" and config.shape.enabled
+        self._stuck_s = limits.stuck_s
+        self.figures = FigureGate(config)
         self._last_read_s = math.nan
         self._last_advance_s = math.nan
         self._stamp: tuple[int, float] | None = None
-        self._laser_jumps, self._gauge_jumps = _Jumps(limits.step_max_um), _Jumps(limits.gauge_step_max_pa)
+        self._laser_jumps, self._gauge_jumps = JumpGate(limits.step_max_um), JumpGate(limits.gauge_step_max_pa)
         self._laser_repeats, self._gauge_repeats = _Repeats(), _Repeats()
+        self._laser_same_s = 0.0
         self.commanded = (0.0, 0.0)
         self.reading: BenchReading | None = None
-        self.displacement_um = self.gauge_pressure_pa = math.nan
+        self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
+        self.optics_replace_laser = False
 
     def wrote(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
@@ -148,26 +82,48 @@ class Observer:
             if self._stamp is None or (stamp[0] != self._stamp[0] and stamp[1] != self._stamp[1]):
                 self._last_advance_s = now_s
                 self._stamp = stamp
-        if self._figures is None:
-            self.displacement_um = self._gate(reading, fresh=self._last_advance_s == now_s)
-        else:
-            self.displacement_um = self._figures.look(now_s, inputs.estimate)
+        uses_laser = not self._by_optics
+        self.laser_um = self._gate(reading, fresh=self._last_advance_s == now_s and uses_laser)
+        same_s = self._laser_repeats.same_s(self.laser_um, now_s)
+        self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
+        self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
+        self.displacement_um = self.guard_um = self.laser_um
+        self.optics_replace_laser = False
+        if self._follows_optics and math.isnan(self.moving_laser_um):
+            self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
+
+    def _replace_laser_by_optics(self) -> None:
+        """Let the figures show the displacement; a stuck laser stays where they show none."""
+        if self.laser_stuck and math.isnan(self.figures.guard_um):
+            return
+        self.displacement_um, self.guard_um = self.figures.loop_um, self.figures.guard_um
+        self.optics_replace_laser = math.isfinite(self.guard_um)
+
+    @property
+    def laser_stuck(self) -> bool:
+        """The laser repeats one value to the last bit, which no film does."""
+        return self._laser_same_s > self._stuck_s
+
+    @property
+    def moving_laser_um(self) -> float:
+        """The laser's reading; NaN also while it is stuck."""
+        return math.nan if self.laser_stuck else self.laser_um
 
     @property
     def unseen(self) -> str:
         """Why there is no displacement in this tick; empty if there is one."""
         if math.isfinite(self.displacement_um):
             return ""
-        if self._figures is not None:
-            return self._figures.missing
+        if self._by_optics:
+            return self.figures.describe_unseen()
         return f"no valid laser reading (quality {self.reading.displacement_quality if self.reading else 'unknown'})"
 
     @property
     def waited_s(self) -> float:
         """How long a camera that is needed took to give its first figure, so far; 0 with a laser."""
-        return 0.0 if self._figures is None else self._figures.waited_s
+        return self.figures.waited_s if self._by_optics else 0.0
 
     def observe(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
         """Return what the inputs show, after `look`; the control code fills in what it knows itself."""
@@ -177,9 +133,11 @@ class Observer:
             link_up=inputs.link_up,
             reading_age_s=now_s - self._last_read_s,
             advance_age_s=now_s - self._last_advance_s,
-            same_s=self._laser_repeats.same_s(self.displacement_um, now_s),
-            displacement_um=_good_quality_um(reading) if self._figures is None else self.displacement_um,
-            unseen_film="" if self._figures is None else self._figures.missing,
+            same_s=self._laser_same_s,
+            displacement_um=self.displacement_um if self._by_optics else _good_quality_um(reading),
+            guard_um=self.guard_um,
+            laser_stuck=self.laser_stuck,
+            unseen_film=self.figures.describe_unseen() if self._by_optics else "",
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self._laser_jumps.count,
             error_um=error_um,

@@ -16,6 +16,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 HOLDING = frozenset({State.HOLD})
+STANDING = HOLDING | {State.SETTLE}  # the mirror is at its setpoint
 CONNECTED = MOVING | {State.CHECK}
 GAS_MOVES = CONNECTED | {State.LOWER}
 ALWAYS = frozenset(State)
@@ -30,7 +31,7 @@ class Observation:
     reading_age_s: float  # since the last answer of the device
     advance_age_s: float  # since its sample counter and time last advanced; a repeated answer does not count
     displacement_um: float  # raw laser reading, or by figures on a bench without a laser; NaN if bad or absent
-    displacement_valid: bool  # finite, new, of good quality, not a jump
+    displacement_valid: bool  # known as well as the state needs it: new, of good quality, not a jump
     jumps: int  # consecutive readings refused as jumps
     error_um: float  # setpoint minus reading; NaN outside the loop, and in a pause
     gauge_pressure_pa: float
@@ -51,19 +52,20 @@ class Observation:
     foreign: int = 0  # changes by another program: claim, watchdog (`roles.FOREIGN_...`)
     gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
     gauge_jumps: int = 0  # consecutive readings that no film can cause
-    laser_gauge_apart: str = ""  # readings of laser and gauge, if they contradict each other
-    optics_hold: bool = False  # the optics see the centre, or must: the laser may be missing
+    laser_gauge_apart: str = ""  # readings of laser (or optics) and gauge, if they contradict each other
+    optics_hold: bool = False  # the optics show the centre, or must: the laser may be missing
     unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
-    estimated_um: float = math.nan  # the centre by them
-    gas_excess: str = ""  # excess gas the film takes, unless a camera sees it stand still
+    guard_um: float = math.nan  # the displacement by the laser, or by the optics where they may replace it
+    laser_stuck: bool = False  # it repeats one value to the last bit
+    gas_excess: str = ""  # excess gas the film takes, unless an independent sensor shows it standing still
     open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
     interlock_level: SafeLevel = SafeLevel.NONE  # the deepest level of the open ones
     interlock_words: str = ""  # the open ones with their texts
 
     @property
     def depth_um(self) -> float:
-        """The laser's reading, or what it would read while only the optics see the centre."""
-        return self.estimated_um if self.optics_hold and math.isnan(self.displacement_um) else self.displacement_um
+        """Displacement that the limits judge: the laser's raw reading, or what replaces a missing or stuck one."""
+        return self.guard_um if math.isnan(self.displacement_um) or self.laser_stuck else self.displacement_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +238,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=14, name="laser_implausible", cause="camera and gauge agree that the laser is wrong",
-        limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=HOLDING,
+        limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=STANDING,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
     ),
@@ -285,7 +287,7 @@ TABLE: tuple[Rule, ...] = (
         code=10, name="displacement_missing", cause="no valid laser reading",
         limit="3 ticks in a row", safe_level=SafeLevel.HOLD_FLOW, seen_in=_A_FEW, may_resume=True,
         remedy="check the laser's aim and its error code",
-        broken=lambda o, c: not o.displacement_valid and not o.optics_hold,
+        broken=lambda o, c: not o.displacement_valid,
     ),
     Rule(
         code=24, name="pressure_missing", cause="no gauge pressure",

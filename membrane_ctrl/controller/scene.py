@@ -98,7 +98,7 @@ class Scene:
     @property
     def strayed(self) -> bool:
         """Whether the mirror has moved too far from its setpoint while no loop holds it."""
-        away_um = abs(self.observer.displacement_um - self.setpoint_um - self.trim_um)
+        away_um = abs(self.observer.guard_um - self.setpoint_um - self.trim_um)
         return away_um > self.config.states.manual_range_um
 
     def stay_good(self, good: bool) -> float:

@@ -4,12 +4,13 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
+from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig
 from membrane_ctrl.control import film, film_health, gas, inner_loop
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller import safety
+from membrane_ctrl.controller.redundancy import FilmSensor, RedundancyWatch
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
@@ -25,7 +26,7 @@ _REPEATS = 3
 class HoldStatus:
     """State of the held mirror."""
 
-    # NaN for old or bad readings and jumps: a mean over ten seconds must not include a bit error
+    # NaN for old, bad or stuck readings and jumps: a mean over ten seconds must not include a bit error
     laser_um: float
     gauge_pressure_pa: float
     setpoint_um: float  # as commanded
@@ -37,12 +38,14 @@ class HoldStatus:
     flow_um_per_s: float  # of the pump; NaN without
     bleed_fraction: float  # of the vent, held open on purpose
     optics_hold: bool = False  # they see the centre, and its estimate is held: a laser that moved is known
+    sag_um: float = math.nan  # by the newest figure; NaN without a usable one
+    figure: ShapeEstimate | None = None  # that arrived in this tick and may be used
 
 
 def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) -> HoldStatus:
     """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick before."""
     return HoldStatus(
-        laser_um=scene.observer.displacement_um,
+        laser_um=scene.observer.moving_laser_um,
         gauge_pressure_pa=scene.observer.gauge_pressure_pa,
         setpoint_um=scene.setpoint_um,
         trim_um=scene.trim_um,
@@ -51,6 +54,8 @@ def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) ->
         flow_um_per_s=last.flow_um_per_s,
         bleed_fraction=scene.loop_config.bleed_fraction,
         optics_hold=optics_hold,
+        sag_um=scene.observer.figures.sag_um,
+        figure=scene.observer.figures.accepted,
     )
 
 
@@ -72,9 +77,14 @@ class SensorConsistency:
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump))
         self._pump = film_health.PumpHealth(config.pump.change_max)
-        self._film = film.FilmMonitor(config.limits, config.optics.mirror)
+        self._laser_film = film.FilmMonitor(config.limits, config.optics.mirror)
+        self._optics_film = film.FilmMonitor(config.limits, config.optics.mirror, "optics")
+        self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
-        self._doubted = False
+        self._follows_optics = config.estimator.process_value != "laser"
+        self._redundancy = RedundancyWatch(config)
+        self._laser_missing_s = 0.0
+        self._doubted = self._drift_noticed = False
         self._growth = film.LeakGrowth()
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s
@@ -96,19 +106,16 @@ class SensorConsistency:
         if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
             self._bleed_fraction = held.bleed_fraction
             self._growth.reset()
-        if state in safety.CONNECTED:
-            apart = self._film.step(dt_s, laser_um, held.trim_um, gauge_pa)
-            self.laser_gauge_apart = apart.replace("laser", "optics") if self._by_optics else apart
-        else:
-            self._film.reset()
-            self.laser_gauge_apart = ""
-        events = self._doubt_sag(state)
+        self._laser_missing_s = 0.0 if math.isfinite(laser_um) else self._laser_missing_s + dt_s
+        self._compare_with_gauge(state, dt_s, held)
+        events = self._doubt_sag(state) + self._notice_drift(state)
+        events += self._watch_redundancy(inputs.now_s, state, held)
         if state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um:
             return events + self._rest()
-        self._look_at_camera(inputs)
+        self._look_at_camera(held.figure)
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self._camera_s <= self._fresh_s
-        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, inputs.estimate, blind)
+        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self._lies_s = self._lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
         self.laser_moved = self._lies_s > film.WARM_S  # a knock is over: the estimate knows the laser's new place
         if self.laser_moved:
@@ -125,6 +132,11 @@ class SensorConsistency:
     def agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
         return self._liar == film.Liar.NOBODY and not self.camera_lies
+
+    @property
+    def camera_drifts(self) -> bool:
+        """The camera is wrong by a slow drift, not by a jump."""
+        return self._plausibility.slow_wrong
 
     @property
     def judges(self) -> bool:
@@ -154,28 +166,80 @@ class SensorConsistency:
         self._plausibility.reset()
         return self._judge(film.Liar.NOBODY)
 
+    @property
+    def _optics_alone(self) -> bool:
+        """Whether the optics show the film in the laser's place."""
+        missing = self._laser_missing_s > film.LASER_GAP_S
+        return self._by_optics or (self._follows_optics and missing)
+
+    def _compare_with_gauge(self, state: State, dt_s: float, held: HoldStatus) -> None:
+        """Compare laser and optics with the gauge, each by itself; the one that shows the film decides.
+
+        Both comparisons run all the time, so that the optics have a reference when the laser is lost.
+        """
+        if state not in safety.CONNECTED:
+            self._laser_film.reset()
+            self._optics_film.reset()
+            self.laser_gauge_apart = ""
+            return
+        gauge_pa = held.gauge_pressure_pa
+        by_laser = self._laser_film.step(dt_s, held.laser_um, held.trim_um, gauge_pa)
+        by_optics = self._optics_film.step(dt_s, held.sag_um - self._nominal_sag_um, 0.0, gauge_pa)
+        self.laser_gauge_apart = by_optics if self._optics_alone else by_laser
+
+    @property
+    def _film_in_use(self) -> film.FilmMonitor:
+        return self._optics_film if self._optics_alone else self._laser_film
+
+    def _notice_drift(self, state: State) -> list[Event]:
+        """Report once that the displacement and the gauge drift apart, which climate may hide a sensor's drift in."""
+        monitor = self._film_in_use
+        noticed = state in safety.CONNECTED and monitor.drifting
+        if noticed == self._drift_noticed:
+            return []
+        self._drift_noticed = noticed
+        sensor = "optics" if self._optics_alone else "laser"
+        if not noticed:
+            return [MaintenanceOver("slow_drift", "the two are near each other again")]
+        message = (
+            f"{sensor} and gauge have moved {monitor.drift_um:.0f} um apart within a day: humidity and "
+            "temperature of the film do this, and so does a sensor that drifts. Compare the laser with a ruler"
+        )
+        return [Maintenance("slow_drift", message)]
+
+    def _watch_redundancy(self, now_s: float, state: State, held: HoldStatus) -> list[Event]:
+        """Report a lost sensor of the film while the pump is driven."""
+        present = {
+            FilmSensor.LASER: math.isfinite(held.laser_um),
+            FilmSensor.OPTICS: held.optics_hold or math.isfinite(held.sag_um),
+            FilmSensor.GAUGE: math.isfinite(held.gauge_pressure_pa),
+        }
+        return self._redundancy.step(now_s, state in safety.MOVING, present)
+
     def _doubt_sag(self, state: State) -> list[Event]:
-        """Tell that optics without a laser may have missed a jump of the film; until the mirror is started anew."""
-        doubted = self._by_optics and state in safety.CONNECTED and (self._doubted or self._film.doubted)
+        """Report once that optics without a laser may have missed a jump of the film, until the next start."""
+        doubted_now = self._optics_alone and self._optics_film.doubted
+        doubted = state in safety.CONNECTED and (self._doubted or doubted_now)
         if doubted == self._doubted:
             return []
         self._doubted = doubted
         if not doubted:
-            return [MaintenanceOver("sag_doubted", "compared anew from here on")]
-        return [Maintenance("sag_doubted", "by the gauge the film has jumped unseen by the optics: start it anew")]
+            return [MaintenanceOver("sag_doubted", "the comparison begins again")]
+        return [
+            Maintenance("sag_doubted", "the gauge shows a jump of the film that the camera missed: restart the hold")
+        ]
 
-    def _look_at_camera(self, inputs: TickInputs) -> None:
-        """Note when the camera last saw the film, and how often it repeated one shape bit by bit."""
-        estimate = inputs.estimate
-        if estimate is None or estimate.verdict == "rejected":
+    def _look_at_camera(self, estimate: ShapeEstimate | None) -> None:
+        """Note when the camera last showed the film, and how often it repeated one shape bit by bit."""
+        if estimate is None:
             return
         self._camera_s = estimate.time_s
         self._repeats = self._repeats + 1 if estimate.sag_um == self._sag_um else 0
         self._sag_um = estimate.sag_um
 
     def _most_growth(self, inputs: TickInputs) -> float:
-        """Allowed growth of the leak: unlimited while the camera agrees with the laser."""
-        if self._by_optics or self._repeats >= _REPEATS:
+        """Allowed growth of the leak: unlimited while the camera agrees with a laser that is there."""
+        if self._optics_alone or self._repeats >= _REPEATS:
             return self._leak_growth_max
         if not inputs.now_s - self._camera_s <= self._fresh_s:
             return self._leak_growth_max
@@ -220,6 +284,42 @@ _STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be th
 _STANDS_S = 1.5  # a sensor that comes and goes within this, as a slower camera does at first, is not reported
 
 
+class MountDrift:
+    """How far the estimate lets the laser's mount drift: as far as the shape loop's trim, `shape.trim_max_um`.
+
+    Laser and optics that drift apart do not show which of them drifts. Beyond the limit the optics are left out, the
+    mirror follows the laser, and a person decides. A knock, which the estimate follows at once, is no drift.
+    """
+
+    def __init__(self, shape: ShapeConfig) -> None:
+        self._most_um, self._rate_um_per_s = shape.trim_max_um, shape.trim_rate_max_um_per_s
+        self.start(0.0)
+
+    def start(self, mount_um: float) -> None:
+        """Count from a place of the mount, in um."""
+        self._mount = LowPass(film.SMOOTH_S)
+        self._mount.reset(mount_um)
+        self._drift_um = 0.0
+        self.beyond_limit = False
+
+    def step(self, mount_um: float, dt_s: float) -> list[Event]:
+        """Follow the mount; returns the notice once the limit is passed, which only `start` takes back."""
+        if self.beyond_limit:
+            return []
+        before_um = self._mount.value
+        moved_um = self._mount.update(mount_um, dt_s) - before_um
+        most_um = self._rate_um_per_s * dt_s  # of a drift; what moves faster is a knock
+        self._drift_um += min(max(moved_um, -most_um), most_um)
+        self.beyond_limit = abs(self._drift_um) > self._most_um
+        if not self.beyond_limit:
+            return []
+        message = (
+            f"laser and optics have drifted {self._most_um:g} um apart; which of them is not known, and the mirror "
+            "follows the laser. Check its mount and the optics, then `ctl shape off` and `on` accept the figure"
+        )
+        return [Maintenance("trim_limit", message)]
+
+
 class Holders:
     """Runs the estimate beside the states if `estimator.process_value` asks for it."""
 
@@ -230,8 +330,10 @@ class Holders:
         self._filter = CentreFilter(config.estimator, config.loop)
         self._tracks = config.shape.mode == "track"
         self._running = self._locking = False
-        # while laser and camera agree: what the filter then gave to the mount was the film's, if the camera was wrong
-        self._agreed_mount = LowPass(film.REFERENCE_S)
+        # While laser and camera agree, by whether a slow drift of the camera is to be undone: what the filter gave to
+        # the mount after that was the film's.
+        self._agreed_mounts = {False: LowPass(film.REFERENCE_S), True: LowPass(film.SLOW_REFERENCE_S)}
+        self._mount_drift = MountDrift(config.shape)
         self._stand = StandGrowth(config.estimator)
         self._stand_most_um, self._stand_told = _STAND_SHARE * config.limits.band_um, False
         self._told: tuple[int, ...] | None = None
@@ -258,19 +360,25 @@ class Holders:
     ) -> list[Event]:
         """One tick, after the sensors were judged; returns what is news."""
         flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
+        figures = scene.observer.figures
         if not self._wanted or state not in _ESTIMATED or not math.isfinite(flow_um_per_s):
             self.estimate, self._running, self._told = None, False, None
             return []
-        laser_um = math.nan if self._by_optics or consistency.laser_lies else seen_um
+        laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
         if not self._running:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._sag_zero_um)
+            sag_zero_um = self._find_sag_zero_um(scene)
+            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, sag_zero_um)
             self._running = True
-            self._agreed_mount.reset(scene.trim_um)
+            for agreed in self._agreed_mounts.values():
+                agreed.reset(scene.trim_um)
+            self._mount_drift.start(scene.trim_um)
             self._stand.lock()
-        figure = self._believed_figure(inputs.estimate, scene.dt_s, shape, consistency)
+        if self._is_anchor(inputs.estimate):
+            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
+        figure = self._select_figure(figures.accepted, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
             gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan, scene.dt_s
@@ -291,28 +399,39 @@ class Holders:
         self.estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = self.estimate.mount_um
         news = [*self._news(inputs.now_s, self.estimate.jumped), *self._told_of_stand()]
+        news += self._mount_drift.step(self.estimate.mount_um, scene.dt_s)
         if self._sees(Sensor.OPTICS):
             sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
             self.estimate = replace(self.estimate, sigma_um=sigma_um)
         return news
 
-    def _believed_figure(
+    def _find_sag_zero_um(self, scene: Scene) -> float:
+        """Sag at which the true centre is at 0, where the optics replace the laser; NaN where they are to be locked."""
+        if self._by_optics:
+            return self._sag_zero_um
+        observer = scene.observer
+        return observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
+
+    def _is_anchor(self, figure: ShapeEstimate | None) -> bool:
+        """Whether a figure is a full set that the tracking's next frames count from."""
+        return figure is not None and self._tracks and figure.kind == "full" and figure.verdict != "rejected"
+
+    def _select_figure(
         self, figure: ShapeEstimate | None, dt_s: float, shape: ShapeState, consistency: SensorConsistency
     ) -> ShapeEstimate | None:
-        """The tick's figure if the filter may use it; locks the filter anew where its reference ended."""
+        """The tick's figure if the filter may use it; locks the filter again where its reference ended."""
         off = shape == ShapeState.OFF and not self._by_optics
         if self._locking and not off:
             self._filter.relock()
+            self._mount_drift.start(self.estimate.mount_um if self.estimate else 0.0)
         self._locking = off
         if consistency.agree and self.estimate is not None:
-            self._agreed_mount.update(self.estimate.mount_um, dt_s)
+            for agreed in self._agreed_mounts.values():
+                agreed.update(self.estimate.mount_um, dt_s)
         elif consistency.camera_lies and self._filter.frames and not self._by_optics:
-            self._filter.blame_optics(self._agreed_mount.value)
-        rejected = figure is None or figure.verdict == "rejected"
-        if figure and figure.kind == "full" and self._tracks and not rejected:
-            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
-            return None
-        return None if off or consistency.camera_lies or rejected else figure
+            self._filter.blame_optics(self._agreed_mounts[consistency.camera_drifts].value)
+        unusable = off or bool(consistency.camera_lies) or self._mount_drift.beyond_limit
+        return None if unusable else figure
 
     def _told_of_stand(self) -> list[Event]:
         """Report once that the optics may be off by the growth of their stand, and once that a new lock ended it."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from firmware_iface.roles import BenchReading
@@ -37,10 +39,21 @@ class Seconds:
         for _ in range(seconds):
             self.now_s += 1.0
             reading = BenchReading(0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0)
-            inputs = TickInputs(self.now_s, 1.0, reading, estimate=self._shape() if camera else None)
-            self.events += self.consistency.ask(
-                inputs, state, 1.0, HoldStatus(0.0, gauge_pa, 0.0, 0.0, 0.0, leak_um_per_s, leak_um_per_s, bleed)
+            figure = self._shape() if camera else None
+            inputs = TickInputs(self.now_s, 1.0, reading, estimate=figure)
+            held = HoldStatus(
+                laser_um=0.0,
+                gauge_pressure_pa=gauge_pa,
+                setpoint_um=0.0,
+                trim_um=0.0,
+                ramp_left_um=0.0,
+                leak_um_per_s=leak_um_per_s,
+                flow_um_per_s=leak_um_per_s,
+                bleed_fraction=bleed,
+                sag_um=math.nan if figure is None else figure.sag_um,
+                figure=figure,
             )
+            self.events += self.consistency.ask(inputs, state, 1.0, held)
 
     def _shape(self) -> ShapeEstimate:
         nothing = np.zeros(36)
@@ -117,3 +130,17 @@ def test_a_camera_that_repeats_one_shape_is_believed_neither_in_the_shape_nor_in
     mirror.camera_stuck = False
     mirror.pass_by(2, camera=True)
     assert mirror.consistency.camera_lies == ""
+
+
+def test_a_gauge_that_drifts_for_hours_against_the_laser_raises_one_notice_and_its_end() -> None:
+    mirror = Seconds()
+    mirror.pass_by(100)
+    for tenth in range(130):  # 0.1 Pa, 2 um, in 100 s: by 260 um
+        mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
+    notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
+    assert [event.kind for event in notices] == ["maintenance"]
+    assert mirror.consistency.laser_gauge_apart == ""
+    for tenth in range(130, 60, -1):
+        mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
+    notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
+    assert [event.kind for event in notices] == ["maintenance", "maintenance_over"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.controller import observer
+from membrane_ctrl.controller import figure_gate, observer
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.tick import TickInputs
@@ -140,7 +140,7 @@ def test_a_start_waits_for_a_camera_that_prepares(
     wait_s: float, starts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cold machine compiles for a minute; but it does not wait for ever."""
-    monkeypatch.setattr(observer, "_CAMERA_STARTS_S", wait_s)
+    monkeypatch.setattr(figure_gate, "_CAMERA_STARTS_S", wait_s)
 
     def prepares(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = now_s < 40.0

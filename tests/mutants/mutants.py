@@ -1,14 +1,19 @@
 """Code made wrong on purpose: what do the fast tests notice, what the campaign alone? Writes docs/mutants.md.
 
-python tests/mutants/mutants.py                       # all, 2 at a time, and the document
-python tests/mutants/mutants.py --only "no wait" "levels"     # those whose words contain one of these; no document
-python tests/mutants/mutants.py --sample 80           # so many, drawn at random, and the document
+python tests/mutants/mutants.py                       # all, 2 at a time
+python tests/mutants/mutants.py --only "no wait" "levels"     # those whose words contain one of these
+python tests/mutants/mutants.py --campaign-sample 60  # fast tests on all, the campaign on so many, drawn at random
+python tests/mutants/mutants.py --missing             # only those without a result of their present text
+
+Results are kept in results.json, from which the document is made; a mutation whose text has changed has none.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.util
+import json
 import os
 import random
 import re
@@ -24,9 +29,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
+from threading import Lock
 
 ROOT = Path(__file__).parents[2]
 LIST = Path(__file__).with_name("mutants.toml")
+RESULTS = Path(__file__).with_name("results.json")
 DOCUMENT = ROOT / "docs" / "mutants.md"
 PRODUCT = ("membrane_ctrl", "firmware_iface")
 # after the tests that an area names: all fast tests of control and devices
@@ -60,6 +67,12 @@ class Mutant:
     find: str
     replace: str
     lives: str = ""
+    guard: str = ""  # name of the `controller.protection.Guard` that it removes, if it removes one
+
+    @property
+    def digest(self) -> str:
+        """Of the mutation's text: a result of another text says nothing."""
+        return hashlib.sha256(f"{self.find}\0{self.replace}".encode()).hexdigest()[:16]
 
     def place(self, root: Path) -> Path:
         """The file that holds the text. Raises LookupError unless it is there exactly once."""
@@ -77,12 +90,12 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Who noticed a mutation; empty: nobody."""
+    """Who noticed a mutation; empty: nobody. `by_campaign` is None where the campaign was not run."""
 
     mutant: Mutant
     place: str
     by_tests: str
-    by_campaign: str
+    by_campaign: str | None
     lasted_s: float
 
 
@@ -178,41 +191,85 @@ def _last_line(text: str) -> str:
     return (text.strip().splitlines() or ["no word"])[-1][:120]
 
 
-def require_sound(tree: Path) -> None:
+def require_sound(tree: Path, with_campaign: bool) -> None:
     """Raise RuntimeError if a test fails without a mutation: then a failure would prove nothing."""
-    for found in (ask_tests(tree, ()), ask_campaign(tree, "")):
-        if found:
-            raise RuntimeError(f"without any mutation: {found}")
+    if found := ask_tests(tree, ()):
+        raise RuntimeError(f"without any mutation: {found}")
+    if with_campaign and (found := ask_campaign(tree, "")):
+        raise RuntimeError(f"without any mutation: {found}")
 
 
-def examine(mutant: Mutant, tree: Path, first: First) -> Verdict:
+def examine(mutant: Mutant, tree: Path, first: First, with_campaign: bool) -> Verdict:
     """Examine one mutation in its own tree."""
     begun_s = time.monotonic()
     with mutated(tree, mutant) as place:
-        by_tests, by_campaign = ask_tests(tree, first.tests), ask_campaign(tree, first.campaign)
+        by_tests = ask_tests(tree, first.tests)
+        by_campaign = ask_campaign(tree, first.campaign) if with_campaign else None
     return Verdict(mutant, place, by_tests, by_campaign, time.monotonic() - begun_s)
 
 
-def examine_all(mutants: Sequence[Mutant], firsts: dict[str, First], at_once: int) -> list[Verdict]:
-    """All mutations, each worker with a copy of the tree outside the repository."""
+def load_results() -> dict[str, dict[str, str | None]]:
+    """What was found so far, by the mutations' words."""
+    if not RESULTS.exists():
+        return {}
+    results: dict[str, dict[str, str | None]] = json.loads(RESULTS.read_text(encoding="utf-8"))
+    return results
+
+
+def store_result(verdict: Verdict) -> None:
+    """Add a result; one of the campaign stays if the same text is examined again without it."""
+    results = load_results()
+    before = results.get(verdict.mutant.what, {})
+    by_campaign = verdict.by_campaign
+    if by_campaign is None and before.get("digest") == verdict.mutant.digest:
+        by_campaign = before.get("by_campaign")
+    results[verdict.mutant.what] = {
+        "digest": verdict.mutant.digest,
+        "place": verdict.place,
+        "by_tests": verdict.by_tests,
+        "by_campaign": by_campaign,
+    }
+    RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def current_verdicts(mutants: Sequence[Mutant]) -> list[Verdict]:
+    """The results of the mutations' present texts, in the list's order."""
+    results = load_results()
+    verdicts = []
+    for mutant in mutants:
+        result = results.get(mutant.what)
+        if result is not None and result["digest"] == mutant.digest:
+            place, by_tests = str(result["place"]), str(result["by_tests"])
+            verdicts.append(Verdict(mutant, place, by_tests, result["by_campaign"], 0.0))
+    return verdicts
+
+
+def examine_all(
+    mutants: Sequence[Mutant], firsts: dict[str, First], at_once: int, for_campaign: Sequence[Mutant]
+) -> list[Verdict]:
+    """All mutations, each worker with a copy of the tree outside the repository; those `for_campaign` also by it."""
+    stored = Lock()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         trees: Queue[Path] = Queue()
         for number in range(at_once):
             shutil.copytree(ROOT, Path(folder) / str(number), ignore=_LEAVE)
             trees.put(Path(folder) / str(number))
         begun_s = time.monotonic()
-        require_sound(trees.queue[0])
+        require_sound(trees.queue[0], with_campaign=bool(for_campaign))
         print(f"{time.monotonic() - begun_s:4.0f} s  without a mutation all tests pass", flush=True)
 
         def one(mutant: Mutant) -> Verdict:
             tree = trees.get()
             try:
-                verdict = examine(mutant, tree, firsts[mutant.area])
+                verdict = examine(mutant, tree, firsts[mutant.area], mutant in for_campaign)
             finally:
                 trees.put(tree)
+            with stored:
+                store_result(verdict)
+            by_campaign = "not run" if verdict.by_campaign is None else verdict.by_campaign or "LIVES"
             print(
                 f"{verdict.lasted_s:4.0f} s  {mutant.what}\n        tests:    {verdict.by_tests or 'LIVES'}"
-                f"\n        campaign: {verdict.by_campaign or 'LIVES'}",
+                f"\n        campaign: {by_campaign}",
                 flush=True,
             )
             return verdict
@@ -228,10 +285,17 @@ def sample(mutants: Sequence[Mutant], number: int) -> list[Mutant]:
     return shuffled[:number]
 
 
+def count_kills(verdicts: Sequence[Verdict]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Killed and examined, by the fast tests and by the campaign."""
+    by_tests = [verdict.by_tests for verdict in verdicts]
+    by_campaign = [verdict.by_campaign for verdict in verdicts if verdict.by_campaign is not None]
+    return (sum(map(bool, by_tests)), len(by_tests)), (sum(map(bool, by_campaign)), len(by_campaign))
+
+
 def document(verdicts: Sequence[Verdict], listed: int) -> str:
     """The result as Markdown; of `listed` mutations these were examined."""
     total = len(verdicts)
-    tests, campaign = (sum(bool(found) for found in column) for column in _columns(verdicts))
+    (tests, _), (campaign, of_campaign) = count_kills(verdicts)
     lines = [
         "# Mutants",
         "",
@@ -240,13 +304,9 @@ def document(verdicts: Sequence[Verdict], listed: int) -> str:
         "such as mutmut, because a tool changes every operator, mostly without an effect on the mirror, and takes "
         "days; the list holds the ways in which each decision about gas can be wrong.",
         "",
-        (
-            f"{listed} mutations are listed"
-            if total == listed
-            else f"{total} of {listed}, drawn at random, were examined"
-        )
-        + f". **Fast tests kill {tests} of {total} ({100 * tests / total:.0f} %), the campaign alone {campaign} "
-        f"({100 * campaign / total:.0f} %).**",
+        (f"{listed} mutations are listed" if total == listed else f"{total} of {listed} were examined")
+        + f". **Fast tests kill {tests} of {total} ({100 * tests / total:.0f} %), the campaign alone {campaign} of "
+        f"{of_campaign} ({100 * campaign / max(of_campaign, 1):.0f} %)**, drawn at random.",
         "",
         "The fast tests are those of control and devices, without the campaign, the real-time tests and the "
         f"comparisons of generated documents ({', '.join(f'`{name}`' for name in COMPARISONS)}). The campaign is its "
@@ -258,17 +318,16 @@ def document(verdicts: Sequence[Verdict], listed: int) -> str:
     lines += [f"| {v.mutant.what} | `{v.place}` | {_cell(v.by_tests)} | {_cell(v.by_campaign)} |" for v in verdicts]
     lines += ["", "## Survivors", ""]
     for verdict in verdicts:
-        who = [name for name, found in (("tests", verdict.by_tests), ("campaign", verdict.by_campaign)) if not found]
+        by = (("tests", verdict.by_tests), ("campaign", verdict.by_campaign))
+        who = [name for name, found in by if found == ""]
         if who:
             lines.append(f"- {verdict.mutant.what} ({' and '.join(who)}): {verdict.mutant.lives or 'not examined'}")
     return "\n".join(lines) + "\n"
 
 
-def _columns(verdicts: Sequence[Verdict]) -> tuple[list[str], list[str]]:
-    return [v.by_tests for v in verdicts], [v.by_campaign for v in verdicts]
-
-
-def _cell(found: str) -> str:
+def _cell(found: str | None) -> str:
+    if found is None:
+        return "not run"
     return f"`{found.replace('|', '/')}`" if found else "**no**"
 
 
@@ -276,21 +335,26 @@ def main(arguments: list[str] | None = None) -> int:
     """Examine the mutants; 1 if a share is below its goal."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="WORDS", help="mutations whose words contain one of these")
-    parser.add_argument("--sample", type=int, metavar="NUMBER")
+    parser.add_argument("--missing", action="store_true", help="only those without a result")
+    parser.add_argument("--campaign-sample", type=int, metavar="NUMBER", help="run the campaign on so many of all")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
-    mutants, firsts = load()
-    listed = len(mutants)
-    if options.sample:
-        mutants = sample(mutants, options.sample)
+    listed, firsts = load()
+    of_campaign = listed if options.campaign_sample is None else sample(listed, options.campaign_sample)
+    chosen = listed
     if options.only:
-        mutants = [m for m in mutants if any(words in m.what for words in options.only)]
-    verdicts = examine_all(mutants, firsts, options.processes)
-    if not options.only:
-        DOCUMENT.write_text(document(verdicts, listed), encoding="utf-8")
-    tests_share, campaign_share = (sum(map(bool, column)) / len(verdicts) for column in _columns(verdicts))
-    print(f"{len(verdicts)} mutants: tests kill {100 * tests_share:.0f} %, the campaign {100 * campaign_share:.0f} %")
-    return int(tests_share < TESTS_GOAL or campaign_share < CAMPAIGN_GOAL)
+        chosen = [mutant for mutant in chosen if any(words in mutant.what for words in options.only)]
+    if options.missing:
+        known = {
+            v.mutant for v in current_verdicts(listed) if v.by_campaign is not None or v.mutant not in of_campaign
+        }
+        chosen = [mutant for mutant in chosen if mutant not in known]
+    examine_all(chosen, firsts, options.processes, [mutant for mutant in chosen if mutant in of_campaign])
+    verdicts = current_verdicts(listed)
+    DOCUMENT.write_text(document(verdicts, len(listed)), encoding="utf-8")
+    (tests, total), (campaign, run) = count_kills(verdicts)
+    print(f"tests kill {tests} of {total}, the campaign {campaign} of {run}; {len(listed)} are listed")
+    return int(tests < TESTS_GOAL * total or campaign < CAMPAIGN_GOAL * run)
 
 
 TESTS_GOAL, CAMPAIGN_GOAL = 0.95, 0.75

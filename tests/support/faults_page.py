@@ -7,7 +7,19 @@ from pathlib import Path
 
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.safety import ALWAYS, CONNECTED, GAS_MOVES, HOLDING, MOVING, NOT_YET_FAULT, TABLE, Rule
+from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
+from membrane_ctrl.controller.redundancy import FilmSensor
+from membrane_ctrl.controller.safety import (
+    ALWAYS,
+    CONNECTED,
+    GAS_MOVES,
+    HOLDING,
+    MOVING,
+    NOT_YET_FAULT,
+    STANDING,
+    TABLE,
+    Rule,
+)
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 _DOCS = Path(__file__).parents[2] / "docs"
@@ -23,6 +35,7 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("check, inflate, settle, hold, manual, tune, lower, fault", GAS_MOVES | {State.FAULT}),
     ("inflate, settle, hold, manual, tune", MOVING),
     ("hold", HOLDING),
+    ("settle, hold", STANDING),
     ("standby, check, lower, fault", ALWAYS - MOVING),
 )
 _LEVELS = {
@@ -75,7 +88,54 @@ def faults_page() -> str:
     lines += [_row(rule) for rule in sorted(TABLE, key=lambda rule: rule.code)]
     lines += ["", "## Faults of the board", "", "| bit | name | meaning |", "|---|---|---|"]
     lines += [f"| {fault.bit} | {fault.name} | {fault.meaning} |" for fault in default_map().faults]
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *_protections(), ""])
+
+
+_CODES = {rule.name: rule.code for rule in TABLE}
+_LETTERS = {guard: chr(ord("a") + number) for number, guard in enumerate(Guard)}
+
+
+def _protections() -> list[str]:
+    """The protection table: what fulfils each duty in each process value and activity."""
+    lines = [
+        "",
+        "## What protects the mirror in each process value and state",
+        "",
+        "Whatever the loop holds (`estimator.process_value`), each duty is fulfilled wherever gas can move. Numbers",
+        "are rules of the table above, letters the guards below; each acts by itself. A dash: two sensors against",
+        "one need a mirror that stands and a third sensor, excess gas needs a mirror that is held. Gains and a pump",
+        "curve on trial change nothing here. (`membrane_ctrl/controller/protection.py`)",
+        "",
+    ]
+    lines += [f"- **{letter}**: {guard.value}" for guard, letter in _LETTERS.items()]
+    for value in ProcessValue:
+        lines += ["", f"`{value.value}`:", "", "| duty | " + " | ".join(a.value for a in Activity) + " |"]
+        lines += ["|---|" + "---|" * len(Activity)]
+        lines += [
+            f"| {duty.value} | " + " | ".join(_keepers(value, activity, duty) for activity in Activity) + " |"
+            for duty in Duty
+        ]
+    lines += [
+        "",
+        "How far the true centre can be off when one sensor of the film fails, with the default limits, and which",
+        "other sensor bounds it. [Protection](protection.md) has what the campaign measured.",
+        "",
+        "| process value | failed | " + " | ".join(failure.value for failure in Failure) + " |",
+        "|---|---|" + "---|" * len(Failure),
+    ]
+    for value in ProcessValue:
+        for sensor in FilmSensor:
+            if value is not ProcessValue.OPTICS or sensor is not FilmSensor.LASER:
+                cells = (find_bound(value, sensor, failure, Config().limits) for failure in Failure)
+                bounds = " | ".join(f"{bound.distance_um:.0f} um ({bound.by.value})" for bound in cells)
+                lines.append(f"| {value.value} | {sensor.value} | {bounds} |")
+    return lines
+
+
+def _keepers(value: ProcessValue, activity: Activity, duty: Duty) -> str:
+    keepers = find_keepers(value, activity, duty)
+    names = [_LETTERS[k] if isinstance(k, Guard) else str(_CODES[k]) for k in keepers]
+    return ", ".join(names) or "-"
 
 
 def _row(rule: Rule) -> str:

@@ -1,0 +1,156 @@
+"""The protection campaign: every cell of the protection table with every failure, and pairs of failures.
+
+python tests/campaign/protection_campaign.py                  # all that is not done yet, and docs/protection.md
+python tests/campaign/protection_campaign.py --only "optics drifts" --value estimate    # some cells, printed
+python tests/campaign/protection_campaign.py --fresh          # forgets what is done
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from protection_cells import BY_WORDS, FAILURES, Outcome, SensorFailure, Undertaking, run_cell
+
+from membrane_ctrl.controller.protection import Activity, ProcessValue
+from membrane_ctrl.controller.redundancy import FilmSensor
+
+RESULTS = Path(__file__).parents[2] / "build" / "protection.jsonl"
+# How long a cell is followed: beyond the ten minutes of a pause or of manual flow; beyond an experiment of a minute;
+# for drifts that take hours in a hold; otherwise for minutes.
+PAUSE_S, TUNE_S, DRIFT_S, HOLD_S = 660.0, 120.0, 45_000.0, 330.0
+_PAIR_SEED = 7
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the campaign."""
+
+    process_value: str
+    undertaking: str
+    failures: tuple[str, ...]
+    seed: int
+
+    @property
+    def lasts_s(self) -> float:
+        """How long it is followed: a drift that takes hours in a hold, everything else for minutes."""
+        undertaking = Undertaking(self.undertaking)
+        slow = any(BY_WORDS[words].slow for words in self.failures)
+        if slow and undertaking is Undertaking.HOLD and len(self.failures) == 1:
+            return DRIFT_S
+        activity = undertaking.activity
+        if activity in (Activity.PAUSE, Activity.MANUAL):
+            return PAUSE_S
+        return TUNE_S if activity is Activity.TUNE else HOLD_S
+
+
+def is_possible(value: ProcessValue, failure: SensorFailure) -> bool:
+    """Whether the sensor has a part in that process value."""
+    return not (value is ProcessValue.OPTICS and failure.sensor is FilmSensor.LASER)
+
+
+def list_singles() -> Iterator[Cell]:
+    """Every process value, undertaking and failure; the seed alternates between two films."""
+    for number, (value, undertaking, failure) in enumerate(product(ProcessValue, Undertaking, FAILURES)):
+        if is_possible(value, failure):
+            yield Cell(value.value, undertaking.value, (failure.words,), 1 + number % 2)
+
+
+def list_pairs() -> Iterator[Cell]:
+    """Pairs of failures of two sensors, each in a cell drawn from the seed: a covering array of the pairs' cells.
+
+    Each failure meets at least one failure of each other sensor in every process value, and each undertaking is drawn
+    equally often.
+    """
+    rng = np.random.default_rng(_PAIR_SEED)
+    undertakings = list(Undertaking)
+    count = 0
+    for value, first in product(ProcessValue, FAILURES):
+        for sensor in FilmSensor:
+            partners = [other for other in FAILURES if other.sensor is sensor and is_possible(value, other)]
+            if sensor is first.sensor or not partners or not is_possible(value, first):
+                continue
+            second = partners[int(rng.integers(len(partners)))]
+            undertaking = undertakings[count % len(undertakings)]
+            count += 1
+            yield Cell(value.value, undertaking.value, (first.words, second.words), 1 + count % 2)
+
+
+def run(cell: Cell) -> Outcome:
+    """Run one cell."""
+    failures = tuple(BY_WORDS[words] for words in cell.failures)
+    value, undertaking = ProcessValue(cell.process_value), Undertaking(cell.undertaking)
+    return run_cell(value, undertaking, failures, cell.seed, cell.lasts_s)
+
+
+def load_done() -> dict[Cell, Outcome]:
+    """The results so far."""
+    done: dict[Cell, Outcome] = {}
+    if RESULTS.exists():
+        for line in RESULTS.read_text(encoding="utf-8").splitlines():
+            entry = json.loads(line)
+            cell = Cell(**{**entry["cell"], "failures": tuple(entry["cell"]["failures"])})
+            done[cell] = Outcome(**{key: math.nan if x is None else x for key, x in entry["outcome"].items()})
+    return done
+
+
+def run_all(cells: Iterable[Cell], processes: int) -> dict[Cell, Outcome]:
+    """Run what is not done yet, slow cells first, and store each result."""
+    done = load_done()
+    wanted = list(cells)
+    todo = sorted((cell for cell in wanted if cell not in done), key=lambda cell: -cell.lasts_s)
+    RESULTS.parent.mkdir(exist_ok=True)
+    with (
+        RESULTS.open("a", encoding="utf-8") as file,
+        ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
+    ):
+        futures = {pool.submit(run, cell): cell for cell in todo}
+        for number, future in enumerate(as_completed(futures), 1):
+            cell, outcome = futures[future], future.result()
+            done[cell] = outcome
+            finite = {
+                key: None if isinstance(x, float) and math.isnan(x) else x for key, x in asdict(outcome).items()
+            }
+            file.write(json.dumps({"cell": asdict(cell), "outcome": finite}) + "\n")
+            file.flush()
+            if number % 50 == 0:
+                print(f"{number} of {len(todo)}", file=sys.stderr)
+    return {cell: done[cell] for cell in wanted}
+
+
+def main() -> int:
+    """Run the campaign, or the cells that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="failures whose names contain this; prints, writes no document")
+    parser.add_argument("--value", default="", help="only this process value")
+    parser.add_argument("--in", dest="within", default="", help="only undertakings whose names contain this")
+    parser.add_argument("--fresh", action="store_true", help="forget what is done")
+    parser.add_argument("--processes", type=int, default=2)
+    arguments = parser.parse_args()
+    if arguments.fresh:
+        RESULTS.unlink(missing_ok=True)
+    if arguments.only or arguments.value or arguments.within:
+        for cell in [*list_singles(), *list_pairs()]:
+            chosen = arguments.value in cell.process_value and arguments.within in cell.undertaking
+            if chosen and arguments.only in " and ".join(cell.failures):
+                print(cell, run(cell), flush=True)
+        return 0
+    results = run_all([*list_singles(), *list_pairs()], arguments.processes)
+    from protection_page import write_page
+
+    violations = write_page(results)
+    print(f"{len(results)} runs, {violations} beyond their bound")
+    return int(violations > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""The protection table is complete, names rules that exist, and no bound rests on the sensor that failed."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
+from membrane_ctrl.controller.redundancy import FilmSensor
+from membrane_ctrl.controller.safety import MOVING, TABLE
+
+RULES = {rule.name: rule for rule in TABLE}
+CELLS = list(product(ProcessValue, Activity, Duty))
+# Two sensors against one need a mirror that stands still and both of them; excess gas needs a mirror held long.
+NOT_EVERYWHERE = {Duty.MAJORITY, Duty.GAS}
+
+
+def test_every_state_in_which_the_pump_may_run_has_a_row() -> None:
+    assert {activity.state for activity in Activity} == MOVING
+
+
+@pytest.mark.parametrize(("value", "activity", "duty"), CELLS, ids=lambda part: part.name.lower())
+def test_every_duty_has_a_keeper_that_is_judged_there(value: ProcessValue, activity: Activity, duty: Duty) -> None:
+    keepers = find_keepers(value, activity, duty)
+    assert keepers or duty in NOT_EVERYWHERE
+    for keeper in keepers:
+        if not isinstance(keeper, Guard):
+            assert activity.state in RULES[keeper].states, keeper
+
+
+def test_every_guard_is_named_somewhere() -> None:
+    named = {keeper for cell in CELLS for keeper in find_keepers(*cell) if isinstance(keeper, Guard)}
+    assert named == set(Guard)
+
+
+@pytest.mark.parametrize(("value", "failed", "failure"), list(product(ProcessValue, FilmSensor, Failure)))
+def test_a_failed_sensor_is_bounded_by_another_one(value: ProcessValue, failed: FilmSensor, failure: Failure) -> None:
+    if value is ProcessValue.OPTICS and failed is FilmSensor.LASER:
+        return  # no laser is used
+    bound = find_bound(value, failed, failure, LimitsConfig())
+    assert bound.by is not failed
+    assert bound.by is not FilmSensor.LASER or value is not ProcessValue.OPTICS
+    assert 0.0 < bound.distance_um < 2855.0  # where the pressure limit would end it

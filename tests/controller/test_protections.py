@@ -1,0 +1,299 @@
+"""Protections follow whichever sensor shows the film: one fails in virtual time, and the true mirror is judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.config.schema import (
+    Config,
+    EstimatorConfig,
+    LimitsConfig,
+    LoopConfig,
+    ShapeConfig,
+    StatesConfig,
+    TwinConfig,
+)
+from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.model.events import ExperimentEnded, Fault, Maintenance, MaintenanceOver, Plausibility
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.telemetry import SafeLevel, State
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
+
+RATE_HZ = 10.0
+Spoil = Callable[[float, ShapeEstimate], ShapeEstimate | None]  # seconds since the failure, the figure
+Fail = Callable[[Wrong, float], None]  # switches of the bench, seconds since the failure
+MANUAL_RANGE_UM = StatesConfig().manual_range_um
+
+
+def config_of(process_value: str, **tables: object) -> Config:
+    """A quiet bench with figures at the tick rate."""
+    return Config.model_validate(
+        {
+            "loop": LoopConfig(rate_hz=RATE_HZ),
+            "shape": ShapeConfig(mode="track", track_rate_hz=RATE_HZ),
+            "estimator": EstimatorConfig(process_value=process_value),  # type: ignore[arg-type]
+            "twin": TwinConfig(scenario="quiet", start_error_um=-1.0, laser=process_value != "optics"),
+            **tables,
+        }
+    )
+
+
+@dataclass
+class Bench:
+    """A held mirror of which one sensor will fail."""
+
+    config: Config
+    spoil: Spoil = lambda since_s, figure: figure
+    settle_s: float = 45.0
+
+    def __post_init__(self) -> None:
+        self.bench = VirtualBench(Plant(self.config.twin, self.config.pump))
+        self._figures = TruthShape(self.bench, self.config, 3, 0.036)
+        self._failed_s = math.inf
+        self.run = VirtualRun(self.config, self.bench, zernike_projection(), self._figure)
+        self.ticks: list[VirtualTick] = []
+        tick = self.run.tick((Command("hold", "a test"),))
+        while tick is not None and State(int(tick.row.state)) != State.HOLD:
+            tick = self.run.tick()
+        self._pass(self.settle_s, lambda wrong, since_s: None)
+        self.ticks.clear()
+
+    def _figure(self, now_s: float) -> ShapeEstimate | None:
+        figure = self._figures(now_s)
+        if figure is None or now_s < self._failed_s:
+            return figure
+        return self.spoil(now_s - self._failed_s, figure)
+
+    def _pass(self, seconds: float, fail: Fail) -> None:
+        begins_s = self.run.now_s
+        while self.run.now_s < begins_s + seconds - 1e-6 and self.run.finished is None:
+            fail(self.bench.wrong, self.run.now_s - begins_s)
+            tick = self.run.tick()
+            assert tick is not None
+            self.ticks.append(tick)
+
+    def command(self, command: Command) -> None:
+        """Give a command, and let it take effect."""
+        tick = self.run.tick((command,))
+        assert tick is not None
+        self.run.tick()
+
+    def fail(self, seconds: float, fail: Fail = lambda wrong, since_s: None) -> Bench:
+        """Let the sensor fail for a while, or until the run ends; afterwards the outcome can be read."""
+        self._failed_s = self.run.now_s
+        self.start_um = self.bench.plant.truth().displacement_um
+        self._pass(seconds, fail)
+        return self
+
+    @property
+    def moved_um(self) -> float:
+        """Largest distance of the true centre from where it was, until the pump was taken off."""
+        moved_um = 0.0
+        for tick in self.ticks:
+            if tick.row.state == State.FAULT:
+                break
+            moved_um = max(moved_um, abs(tick.row.truth_displacement_um - self.start_um))
+        return moved_um
+
+    @property
+    def state(self) -> State:
+        """The last state."""
+        return State(int(self.ticks[-1].row.state))
+
+    def told(self, kind: type) -> list[object]:
+        """The events of a kind."""
+        return [event for tick in self.ticks for event in tick.events if isinstance(event, kind)]
+
+    @property
+    def faults(self) -> list[str]:
+        """Names of the faults, in order."""
+        return [event.name for event in self.told(Fault)]  # type: ignore[attr-defined]
+
+    @property
+    def notices(self) -> list[str]:
+        """Names of the notices, in order."""
+        return [event.name for event in self.told(Maintenance)]  # type: ignore[attr-defined]
+
+
+def lose_laser(wrong: Wrong, since_s: float) -> None:
+    wrong.no_light = True
+
+
+def stick_laser(wrong: Wrong, since_s: float) -> None:
+    wrong.laser_stuck = True
+
+
+def drifting(um_per_s: float) -> Spoil:
+    return lambda since_s, figure: replace(figure, sag_um=figure.sag_um + um_per_s * since_s)
+
+
+def frozen() -> Spoil:
+    """The first figure again and again, with fresh noise."""
+    rng = np.random.default_rng(5)
+    first: list[float] = []
+
+    def spoil(since_s: float, figure: ShapeEstimate) -> ShapeEstimate:
+        first.append(figure.sag_um)
+        return replace(figure, sag_um=first[0] + 0.036 * rng.standard_normal())
+
+    return spoil
+
+
+@pytest.mark.parametrize("lose", [lose_laser, stick_laser], ids=["lost", "stuck"])
+@pytest.mark.parametrize("flow_um_per_s", [5.0, 0.0])
+def test_manual_flow_stays_within_its_range_when_the_laser_fails(lose: Fail, flow_um_per_s: float) -> None:
+    held = Bench(config_of("estimate"))
+    held.command(Command("manual", "a test", value=flow_um_per_s))
+    held.fail(60.0, lose)
+    assert held.moved_um < MANUAL_RANGE_UM + 10.0
+    assert held.state in (State.INFLATE, State.SETTLE, State.HOLD)
+    assert held.faults == []
+
+
+@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+def test_manual_flow_with_frozen_figures_is_stopped_by_the_gauge(process_value: str) -> None:
+    held = Bench(config_of(process_value), frozen())
+    held.command(Command("manual", "a test", value=5.0))
+    held.fail(60.0, lose_laser)
+    assert held.faults == ["laser_gauge_apart"]
+    assert held.moved_um < 65.0
+
+
+def test_the_displacement_limit_holds_by_the_optics_when_the_laser_is_lost() -> None:
+    limits = LimitsConfig(displacement_max_um=30.0)
+    held = Bench(config_of("estimate", limits=limits))
+    held.command(Command("manual", "a test", value=5.0))
+    held.fail(40.0, lose_laser)
+    assert held.faults == ["over_displacement"]
+    assert held.moved_um < 36.0
+
+
+@pytest.mark.parametrize("um_per_s", [-5.0, -1.0, -0.5, 1.0])
+def test_drifting_optics_that_hold_without_a_laser_are_stopped_by_the_gauge(um_per_s: float) -> None:
+    held = Bench(config_of("estimate"), drifting(um_per_s)).fail(200.0, lose_laser)
+    assert held.faults == ["laser_gauge_apart"]
+    assert held.moved_um < 65.0
+    assert held.notices[0] == "laser_lost"
+    assert held.state == State.FAULT
+
+
+def test_the_loss_of_the_laser_is_reported_at_once_and_its_return_too() -> None:
+    def lose(wrong: Wrong, since_s: float) -> None:
+        wrong.no_light = 5.0 < since_s < 20.0
+
+    held = Bench(config_of("estimate")).fail(40.0, lose)
+    times_s = [
+        t.row.mono_s - held.ticks[0].row.mono_s for t in held.ticks for e in t.events if isinstance(e, Maintenance)
+    ]
+    assert held.notices == ["laser_lost"]
+    assert times_s[0] == pytest.approx(7.0, abs=0.3)
+    (notice,) = held.told(Maintenance)
+    assert notice.message.startswith("the laser is lost; optics and gauge are left")  # type: ignore[attr-defined]
+    assert [event.name for event in held.told(MaintenanceOver)] == ["laser_lost"]  # type: ignore[attr-defined]
+    assert held.faults == []
+
+
+def test_a_laser_that_blinks_is_not_reported() -> None:
+    def blink(wrong: Wrong, since_s: float) -> None:
+        wrong.no_light = since_s % 10.0 < 1.0
+
+    assert Bench(config_of("estimate")).fail(40.0, blink).notices == []
+
+
+@pytest.mark.parametrize("process_value", ["laser", "estimate", "optics"])
+def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) -> None:
+    """The weather moves the film after the pause; what the loop follows shows nothing of it."""
+    held = Bench(config_of(process_value, states=StatesConfig(pause_max_s=20.0)), frozen())
+    held.command(Command("pause", "a test"))
+
+    def fail(wrong: Wrong, since_s: float) -> None:
+        wrong.no_light = process_value == "estimate"
+        wrong.pump_share = 0.5  # a pump that gives half of its flow, so that the film must sink
+        if process_value == "laser":  # it shows its place with noise, whatever the film does
+            wrong.laser_offset_um = held.start_um - held.bench.plant.truth().displacement_um
+
+    held.fail(300.0, fail)
+    assert held.moved_um < 65.0
+    assert held.state == State.FAULT
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda since_s, figure: replace(figure, sag_sigma_um=math.nan),
+        lambda since_s, figure: replace(figure, sag_sigma_um=1e3),
+        lambda since_s, figure: replace(figure, sag_sigma_um=-1.0),
+        lambda since_s, figure: replace(figure, time_s=math.nan),
+        lambda since_s, figure: replace(figure, time_s=figure.time_s + 5.0),
+        lambda since_s, figure: replace(figure, time_s=figure.time_s - 30.0),
+        lambda since_s, figure: replace(figure, sag_um=math.nan),
+    ],
+    ids=["sigma nan", "sigma huge", "sigma negative", "time nan", "future", "late", "sag nan"],
+)
+@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+def test_a_figure_that_cannot_be_used_counts_as_missing(spoil: Spoil, process_value: str) -> None:
+    held = Bench(config_of(process_value), spoil).fail(40.0, lose_laser)
+    first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
+    assert held.faults[0] == first
+    assert held.moved_um < 10.0
+    assert held.state == State.FAULT
+
+
+@pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
+def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float) -> None:
+    held = Bench(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
+    assert [event.liar for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
+    assert held.moved_um < 40.0
+    assert held.faults == []
+    assert abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 20.0  # most of it is undone
+
+
+def test_laser_and_optics_may_drift_apart_no_further_than_the_trim() -> None:
+    shape = ShapeConfig(mode="track", track_rate_hz=RATE_HZ, trim_max_um=10.0)
+    held = Bench(config_of("estimate", shape=shape), drifting(0.03)).fail(700.0)
+    assert "trim_limit" in held.notices
+    assert held.moved_um < 14.0
+
+
+def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> None:
+    held = Bench(config_of("estimate"))
+    spec = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
+    held.command(Command("tune", "a test", experiment=spec))
+    held.fail(20.0, lose_laser)
+    (ended,) = held.told(ExperimentEnded)
+    assert not ended.completed  # type: ignore[attr-defined]
+    assert held.moved_um < 10.0
+    assert held.state == State.HOLD
+
+
+def test_gas_that_the_film_takes_is_judged_while_only_the_optics_show_it_standing() -> None:
+    limits = LimitsConfig(laser_gauge_apart_max_um=400.0)
+    held = Bench(config_of("estimate", limits=limits), frozen(), settle_s=130.0)
+
+    def fail(wrong: Wrong, since_s: float) -> None:
+        wrong.no_light = True
+        wrong.vent_stuck_fraction = 0.02  # the film takes 2 um/s more
+
+    held = Bench(config_of("estimate", limits=limits), settle_s=130.0).fail(150.0, fail)
+    assert held.faults == ["gas_excess"]
+
+
+def test_a_hold_inflates_again_by_the_optics_after_manual_flow() -> None:
+    held = Bench(config_of("estimate"))
+    held.command(Command("manual", "a test", value=0.0))
+    held.fail(20.0, lose_laser)
+    held.command(Command("hold", "a test"))
+    held.ticks.clear()
+    held._pass(40.0, lose_laser)
+    assert held.state == State.HOLD
+    assert held.ticks[-1].row.safe_level == SafeLevel.NONE
+    assert abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 2.0
