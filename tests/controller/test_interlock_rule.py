@@ -205,6 +205,34 @@ def test_a_deeper_interlock_during_a_fault_deepens_the_level_and_a_milder_one_do
     assert len(rig.faults) == 1
 
 
+def test_of_several_open_at_once_the_deepest_level_is_entered_and_all_are_named() -> None:
+    rig = Rig()
+    rig.until(State.HOLD, hold())
+    rig.circuits.lost_names = {"supply"}
+    rig.go(INTERLOCKS[SUPPLY].age_max_s - 0.05)  # type: ignore[union-attr]  # counts as open in the next tick
+    rig.circuits.open_names = {"door", "stop_button"}
+    tick = rig.tick()
+    assert SafeLevel(int(tick.row.safe_level)) == SafeLevel.VENT
+    fault = next(event for event in tick.events if isinstance(event, Fault))
+    assert fault.safe_level == "vent"
+    assert "interlock door is open" in fault.seen
+    assert "interlock stop_button is open" in fault.seen
+
+
+def test_one_that_opens_as_a_fault_resumes_cancels_the_hold() -> None:
+    rig = Rig()
+    rig.until(State.HOLD, hold())
+    rig.bench.wrong.unreachable = True
+    rig.go(3.0)
+    rig.bench.wrong.unreachable = False
+    rig.until(State.STANDBY)
+    assert len(rig.of(Resumed)) == 1
+    rig.circuits.open_names = {"door"}
+    assert State(int(rig.tick().row.state)) == State.STANDBY
+    rig.circuits.open_names = set()
+    assert State(int(rig.go(5.0).row.state)) == State.STANDBY
+
+
 def test_it_deepens_a_fault_of_another_cause_which_then_never_resumes() -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
