@@ -54,7 +54,8 @@ class BenchReading:
 
     `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen values. Quantities
     the bench lacks are NaN. `displacement_quality` is 0 when good (else the laser's error code). `foreign` tells
-    which of claim and watchdog another program has changed (FOREIGN_ bits).
+    which of claim and watchdog another program has changed (FOREIGN_ bits). Bit i of `interlocks_open` is set while
+    the circuit of the configuration's interlock i is open, or its signal is lost.
     """
 
     displacement_um: float
@@ -71,6 +72,7 @@ class BenchReading:
     latched_faults: int
     foreign: int = 0
     interlock_inputs: int = 0  # bit i: the board's interlock input i is closed; 0 without inputs: all open
+    interlocks_open: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +221,13 @@ class Vent(Device, Protocol):
 
     async def vent_fraction(self) -> float:
         """The commanded (or actual) value reported by the device. Raises LinkError."""
+
+
+class InterlockSource(Device, Protocol):
+    """A device that reads the circuits of one or several interlocks."""
+
+    async def closed_circuits(self) -> tuple[bool, ...]:
+        """Whether each circuit is closed, in the order in which the source was given them. Raises LinkError."""
 
 
 # What the device of a role is asked for in every tick, and in which unit it answers

@@ -246,6 +246,81 @@ ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the othe
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
 
 
+_INTERLOCK_NAME = "Name in messages. Set it to a word of lower-case letters, digits and `_`, such as door."
+_INTERLOCK_TEXT = "For people, while the circuit is open. Set it to what is open and what to do."
+_INTERLOCK_LEVEL = (
+    "Safe level that an open circuit, or a lost signal, enters. Set it to vent where pressure in the mirror is the "
+    "danger, to ramp_down where a sudden stop is."
+)
+_PERIOD = "Interval between requests. Lower it for a contact that may open for a moment only."
+_AGE_MAX = "Age from which an answer no longer counts: the circuit is then open. Raise it for a slow line."
+InterlockName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$", description=_INTERLOCK_NAME)]
+InterlockText = Annotated[str, Field(min_length=1, max_length=200, description=_INTERLOCK_TEXT)]
+InterlockLevel = Annotated[Literal["ramp_down", "pump_off", "vent"], Field(description=_INTERLOCK_LEVEL)]
+PollPeriod = Annotated[float, Field(ge=0.01, le=10, description=_PERIOD)]
+PollAgeMax = Annotated[float, Field(ge=0.05, le=30, description=_AGE_MAX)]
+BOARD_INPUTS = 16
+
+
+class InterlockConfig(Section):
+    """A normally closed circuit that prevents a hold, and ends one, while it is open."""
+
+    name: InterlockName
+    text: InterlockText
+    safe_level: InterlockLevel = "pump_off"
+
+    @model_validator(mode="after")
+    def _one_line_of_text(self) -> "InterlockConfig":
+        if not self.text.isprintable() or not self.text.strip():
+            raise ValueError("text: only printable characters, in one line")
+        return self
+
+
+class BoardInputConfig(InterlockConfig):
+    """Interlock at an input of the pump board, from register map version 3 on."""
+
+    driver: Literal["board_input"]
+    input: Annotated[int, Field(ge=0, le=BOARD_INPUTS - 1)]
+    """Number of the board's input, counted from 0. Set it as wired."""
+
+
+class PolledInterlockConfig(InterlockConfig):
+    """Interlock at a device that is asked again and again."""
+
+    period_s: PollPeriod = 0.1
+    age_max_s: PollAgeMax = 0.5
+
+
+class ModbusInputConfig(PolledInterlockConfig):
+    """Interlock at a discrete input or coil of a Modbus device; 1 means closed."""
+
+    driver: Literal["modbus_input"]
+    link: ModbusUrl
+    unit_id: UnitId = 1
+    timeout_s: Timeout = 0.2
+    function: Literal["discrete", "coil"] = "discrete"
+    """Kind of bit. Set it to coil for a device without discrete inputs: a coil keeps what was last written."""
+    address: Word
+    """Address of the bit, counted from 0. Set it from the device's manual."""
+
+
+class GpioLineConfig(PolledInterlockConfig):
+    """Interlock at a GPIO line of this machine."""
+
+    driver: Literal["gpio_line"]
+    chip: Annotated[str, Field(min_length=1)] = "/dev/gpiochip0"
+    """The chip's device file. Set it to the one that `gpiodetect` lists."""
+    line: Annotated[int, Field(ge=0, le=4095)]
+    """Number of the line on its chip. Set it as wired; `gpioinfo` lists names and numbers."""
+    wiring: Literal["to_ground", "to_supply"] = "to_ground"
+    """What the closed contact connects the line to. Set it as wired; a cut wire then reads as open."""
+    pull: Literal["internal", "external"] = "internal"
+    """Resistor that defines the level of an open contact. Set it to external if the chip has none of its own."""
+
+
+InterlockDriver = Annotated[BoardInputConfig | ModbusInputConfig | GpioLineConfig, Driver]
+
+
 class AravisCameraConfig(Section):
     """A GenICam camera (USB3 Vision or GigE Vision)."""
 

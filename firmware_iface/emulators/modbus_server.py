@@ -14,7 +14,7 @@ from firmware_iface.emulators.serial_device import SerialDevice
 from firmware_iface.links.serial_port import SerialSettings
 
 READ_HOLDING, WRITE_SINGLE, WRITE_MULTIPLE, READ_WRITE = 3, 6, 16, 23
-ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, BUSY = 1, 2, 3, 6
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, BUSY = 1, 2, 3, 4, 6
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of what follows, unit
 _LENGTH_MAX = 254  # unit + the longest PDU of 253 bytes

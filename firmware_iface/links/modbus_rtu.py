@@ -19,6 +19,8 @@ DEFAULT_BAUD = 19_200  # section 2.5.1: the default of the standard
 _FAST_BAUD = 19_200
 _FAST_GAP_S = 1.75e-3  # above 19200 baud the standard fixes the silence between frames
 _EXCEPTION_BYTES, _WRITE_BYTES = 5, 8
+_READS_REGISTERS = (modbus_tcp.READ_HOLDING, modbus_tcp.READ_INPUT)
+_READS_BITS = (modbus_tcp.READ_COILS, modbus_tcp.READ_DISCRETE)
 _TOKENS = 2**16
 
 
@@ -133,6 +135,14 @@ class GuardedModbusRtu:
         """Read input registers (function code 4). Raises as `read_holding`."""
         return await self._read(modbus_tcp.READ_INPUT, address, count)
 
+    async def read_coils(self, address: int, count: int) -> list[bool]:
+        """Read coils (function code 1). Raises as `read_holding`."""
+        return await self._read_bits(modbus_tcp.READ_COILS, address, count)
+
+    async def read_discrete(self, address: int, count: int) -> list[bool]:
+        """Read discrete inputs (function code 2). Raises as `read_holding`."""
+        return await self._read_bits(modbus_tcp.READ_DISCRETE, address, count)
+
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `read_holding`."""
         what = f"{self.name}: writing {address}"
@@ -158,6 +168,13 @@ class GuardedModbusRtu:
         what = f"{self.name}: reading {address}..{address + count - 1}"
         reply = await self._transact(struct.pack(">BHH", function_code, address, count), 5 + 2 * count, what)
         return list(struct.unpack(f">{count}H", reply[2:]))
+
+    async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:
+        what = f"{self.name}: reading bits {address}..{address + count - 1}"
+        answer_bytes = 5 + modbus_tcp.bytes_of_bits(count)
+        reply = await self._transact(struct.pack(">BHH", function_code, address, count), answer_bytes, what)
+        packed = int.from_bytes(reply[2:], "little")  # the first coil is the lowest bit of the first byte
+        return [bool(packed >> place & 1) for place in range(count)]
 
     async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
         question = self._question(pdu, answer_bytes, what)
@@ -188,7 +205,7 @@ class ModbusLinks:
     def __init__(self) -> None:
         self._buses: dict[str, RtuBus] = {}
 
-    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_tcp.ModbusLink:
+    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_tcp.AnyModbusLink:
         """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
 
         `fence`: see `links.exchange`; TCP does not use it. Raises ValueError for a URL that is neither.
@@ -229,12 +246,11 @@ def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int
         length = answer_bytes
     else:
         raise LinkError(f"{what}: answer has function code {heard[1]}, expected {function_code}")
-    if (
-        function_code in (modbus_tcp.READ_HOLDING, modbus_tcp.READ_INPUT)
-        and length == answer_bytes
-        and heard[2] != answer_bytes - 5
-    ):
-        raise LinkError(f"{what}: {heard[2] / 2:g} registers instead of {(answer_bytes - 5) // 2}")
+    data_bytes = answer_bytes - 5
+    if length == answer_bytes and function_code in _READS_REGISTERS and heard[2] != data_bytes:
+        raise LinkError(f"{what}: {heard[2] / 2:g} registers instead of {data_bytes // 2}")
+    if length == answer_bytes and function_code in _READS_BITS and heard[2] != data_bytes:
+        raise LinkError(f"{what}: {heard[2]} bytes of bits instead of {data_bytes}")
     if len(heard) < length:
         return None
     if len(heard) > length:

@@ -20,6 +20,7 @@ from firmware_iface.roles import Clock, DeviceBusyError, DeviceRefusedError, Lin
 
 # Modbus semantics, independent of the transport.
 
+READ_COILS, READ_DISCRETE = 1, 2
 READ_HOLDING, READ_INPUT, WRITE_SINGLE, DIAGNOSTICS, WRITE_MULTIPLE = 3, 4, 6, 8, 16
 EXCEPTION_FLAG = 0x80
 EXCEPTIONS = {
@@ -64,6 +65,39 @@ class ModbusLink(Protocol):
 
     async def close(self) -> None:
         """Close; a request in flight fails at once."""
+
+
+class ModbusBitLink(Protocol):
+    """One Modbus device with coils or discrete inputs. All raise LinkError kinds."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up."""
+
+    async def connect(self) -> None:
+        """Connect anew."""
+
+    async def read_coils(self, address: int, count: int) -> list[bool]:
+        """Function code 1."""
+
+    async def read_discrete(self, address: int, count: int) -> list[bool]:
+        """Function code 2."""
+
+    async def close(self) -> None:
+        """Close; a request in flight fails at once."""
+
+
+class AnyModbusLink(ModbusLink, ModbusBitLink, Protocol):
+    """One Modbus device with registers, coils and discrete inputs."""
+
+
+def bytes_of_bits(count: int) -> int:
+    """Number of bytes in which so many coils or discrete inputs are sent."""
+    return (count + 7) // 8
 
 
 def exception_error(what: str, code: int) -> LinkError:
@@ -145,6 +179,14 @@ class GuardedModbusTcp:
         """Read `count` input registers (function code 4). Raises as `read_holding`."""
         return await self._read(READ_INPUT, address, count)
 
+    async def read_coils(self, address: int, count: int) -> list[bool]:
+        """Read `count` coils (function code 1). Raises as `read_holding`."""
+        return await self._read_bits(READ_COILS, address, count)
+
+    async def read_discrete(self, address: int, count: int) -> list[bool]:
+        """Read `count` discrete inputs (function code 2). Raises as `read_holding`."""
+        return await self._read_bits(READ_DISCRETE, address, count)
+
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
         what = f"{self.name}: writing {address}"
@@ -181,6 +223,20 @@ class GuardedModbusTcp:
             raise LinkError(f"{what}: {len(reply.registers)} registers instead of {count}")
         self._back_off.succeeded()
         return list(reply.registers)
+
+    async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:
+        what = f"{self.name}: reading bits {address}..{address + count - 1}"
+
+        def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
+            read = client.read_discrete_inputs if function_code == READ_DISCRETE else client.read_coils
+            return read(address, count=count, device_id=self._unit_id)
+
+        reply = await self._exchange(send, function_code, what)
+        # the library gives all bits of the bytes that came
+        if len(reply.bits) != 8 * bytes_of_bits(count):
+            raise LinkError(f"{what}: {len(reply.bits)} bits in the reply, expected {8 * bytes_of_bits(count)}")
+        self._back_off.succeeded()
+        return [bool(bit) for bit in reply.bits[:count]]
 
     async def close(self) -> None:
         """Close the connection; a request in flight fails at once."""

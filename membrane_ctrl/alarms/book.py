@@ -55,6 +55,12 @@ def signs_of(event: events.Event) -> list[Sign]:
             return [Sign(f"maintenance_{event.name}", True, "warning", event.message)]
         case events.MaintenanceOver():
             return [Sign(f"maintenance_{event.name}", False)]
+        case events.InterlockOpened():
+            return [
+                Sign("interlock", True, "warning", f"interlock {event.name} is open: {event.text}", about=event.name)
+            ]
+        case events.InterlockClosed():
+            return [Sign("interlock", False, about=event.name)]
         case events.Plausibility():
             who = _LIARS.get(event.liar, "one of them")
             text = f"laser and camera do not agree; {who} is wrong ({event.seen})"

@@ -19,6 +19,7 @@ from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import optical_bench, session
 from membrane_ctrl.alarms.process import require_sendable
+from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
@@ -54,10 +55,14 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     Raises InputError with one line per bad setting; after the report, DeviceError if a device cannot be used.
     """
     findings = dict.fromkeys(require_sound(config, source))  # before touching any device
-    probes = _probed(config)
+    if config.devices is not None:
+        bench.require_places(config.devices)
+    probes, circuits = _probed(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     would = _what_would_happen(config)
+    if config.interlocks:
+        would["interlocks"] = interlock_check.describe_effect(circuits)
     if as_json:
         listed = [{key: value for key, value in asdict(probe).items() if key != "facts"} for probe in probes]
         found = [asdict(finding) for finding in findings]
@@ -65,12 +70,14 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
             "schema": "membrane-check/1",
             "source": source,
             "devices": listed,
+            "interlocks": [asdict(circuit) for circuit in circuits],
             "findings": found,
             "would": would,
         }
         print(plain_json.dumps(report))
     else:
-        _show(source, probes, would, [finding.line(source) for finding in findings if finding.severity == "warning"])
+        warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
+        _show(source, probes, circuits, would, warnings)
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
     if refused:
         raise errors.FindingsError(refused)
@@ -79,20 +86,25 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         raise errors.DeviceError(
             f"{len(wrong)} of {len(probes)} devices cannot be used; {wrong[0].role}: {wrong[0].problem}"
         )
+    lost = [circuit for circuit in circuits if circuit.problem]
+    if lost:
+        raise errors.DeviceError(f"interlock {lost[0].name}: {lost[0].problem}")
     return errors.Exit.DONE
 
 
-def _probed(config: Config) -> list[DeviceProbe]:
-    """Probe the devices, except those (including the screen) that another program uses."""
+def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
+    """Probe devices and interlocks, except those (including the screen) that another program uses."""
     devices = config.devices
     if devices is None:
-        return probe_optics(config)
+        return probe_optics(config), []
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(bench.locked(bench.device_names(devices)))
         except errors.DeviceError as error:
-            return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))]
-        return asyncio.run(_probes(devices, not config.by_optics)) + probe_optics(config)
+            return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))], []
+        probes = asyncio.run(_probes(devices, not config.by_optics))
+        circuits = asyncio.run(interlock_check.probe_interlocks(devices))
+        return probes + probe_optics(config), circuits
 
 
 async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
@@ -101,7 +113,13 @@ async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
     return await probe_roles(bench.role_devices(devices))
 
 
-def _show(source: str, probes: list[DeviceProbe], would: dict[str, str], warnings: list[str]) -> None:
+def _show(
+    source: str,
+    probes: list[DeviceProbe],
+    circuits: list[interlock_check.InterlockProbe],
+    would: dict[str, str],
+    warnings: list[str],
+) -> None:
     console = terminal.table_console()
     if probes:
         table = Table("role", "device", "identity", "reading", "p50 / p99 ms")
@@ -114,6 +132,12 @@ def _show(source: str, probes: list[DeviceProbe], would: dict[str, str], warning
         for word, line in (("wrong", probe.problem), ("note", probe.notes)):
             if line:
                 console.print(f"{probe.role}: {word}: {line}", soft_wrap=True)
+    if circuits:
+        console.print(interlock_check.interlock_table(circuits))
+        console.print(interlock_check.HOW_TO_TEST, soft_wrap=True)
+    for circuit in circuits:
+        if circuit.problem:
+            console.print(f"interlock {circuit.name}: wrong: {circuit.problem}", soft_wrap=True)
     for warning in warnings:
         console.print(warning, soft_wrap=True)
     table = Table(title=source, title_justify="left", show_header=False)

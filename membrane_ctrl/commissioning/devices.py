@@ -21,6 +21,7 @@ from firmware_iface.links import aravis
 from firmware_iface.links.serial_port import serial_ports
 from membrane_ctrl.config import reference, toml_file
 from membrane_ctrl.config.schema import NEEDED, ROLES, Config, DevicesConfig
+from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, terminal
 
 _DRM = Path("/sys/class/drm")
@@ -116,7 +117,9 @@ def write_first(path: Path, twin: bool, ask: bool) -> int:
         raise errors.InputError(f"{path}: exists already, and is not overwritten; name another file")
     found = [] if twin else _connected()
     tables = _answers(found) if ask else {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
-    toml_file.parse(tables, Config, str(path))
+    parsed = toml_file.parse(tables, Config, str(path))
+    if parsed.devices is not None:
+        bench.require_places(parsed.devices)
     text = "\n".join([_HEAD.format(name=path.name), *_listed(found), *_written("", tables)])
     with errors.writing(path), path.open("x", encoding="utf-8") as file:
         file.write(text + "\n")

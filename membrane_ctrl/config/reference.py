@@ -102,6 +102,8 @@ def _places(schema: Any, prefix: str, table: Any, defaults: Any) -> Iterator[tup
         place = f"{prefix}{key}"
         for name in re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(field)):
             inner = defaults.get(key) if isinstance(defaults, dict) else None
+            if inner is None and field.get("type") == "array":  # below a table that is absent by default
+                inner = []
             yield place, name, inner
             yield from _places(schema, f"{place}.", schema["$defs"][name], inner)
 
@@ -181,7 +183,7 @@ def _range(field: Any) -> str:
         return "true, false"
     if "pattern" in field:
         return f"text like {field['pattern']}"
-    return "a table" if "$ref" in field else "a file" if field.get("format") == "path" else "text"
+    return "a table" if "$ref" in field or "oneOf" in field else "a file" if field.get("format") == "path" else "text"
 
 
 def _shown(default: Any) -> str:

@@ -8,13 +8,14 @@ when to change it. Everything that explains the configuration is made from these
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from firmware_iface import settings
 from firmware_iface.settings import Section
+from membrane_ctrl.config import device_places
 from membrane_ctrl.config.control import (
     EstimatorConfig,
     LimitsConfig,
@@ -41,6 +42,7 @@ __all__ = [
 ]  # fmt: skip
 
 ROLES = ("displacement", "pump", "gauge_pressure", "vent", "barometer", "thermometer")
+INTERLOCKS_MAX = 32  # bits of a mask that telemetry carries as a double
 # required before any gas moves: the loop's two ends, and the limit that protects the film
 NEEDED = ("displacement", "pump", "gauge_pressure")
 
@@ -62,6 +64,8 @@ class DevicesConfig(Section):
     thermometer: settings.ValueDriver | None = None
     camera: settings.CameraConfig | None = None
     screen: settings.PygameScreenConfig | None = None
+    interlocks: Annotated[tuple[settings.InterlockDriver, ...], Field(max_length=INTERLOCKS_MAX)] = ()
+    """Circuits that must be closed for a hold, at most 32. Set it for emergency stop, door, oxygen monitor."""
 
     @model_validator(mode="after")
     def _board_or_roles(self) -> "DevicesConfig":
@@ -82,17 +86,35 @@ class DevicesConfig(Section):
     @model_validator(mode="after")
     def _one_owner_a_port(self) -> "DevicesConfig":
         owners: dict[str, tuple[str, str]] = {}
-        for role, section in self.roles().items():
-            link = ""
-            if isinstance(section, settings.ON_MODBUS):
-                link, port = section.link, section.link.removeprefix("rtu://").partition("?")[0]
-            else:
-                port = section.port
+        for role, port, link in self.list_ports():
             other, other_link = owners.setdefault(port, (role, link))
             if other != role and not (link and link == other_link):
                 raise ValueError(
                     f"{other} and {role} name the same port, {port}; only Modbus devices on one link may share it"
                 )
+        return self
+
+    def list_ports(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the role, the port and, of Modbus devices, the link of everything that has one."""
+        if self.board is not None:
+            yield "board", _port_of(self.board), self.board
+        for role, section in self.roles().items():
+            if isinstance(section, settings.ON_MODBUS):
+                yield role, _port_of(section.link), section.link
+            else:
+                yield role, section.port, ""
+        for index, interlock in enumerate(self.interlocks):
+            if isinstance(interlock, settings.ModbusInputConfig):
+                yield f"interlocks.{index}", _port_of(interlock.link), interlock.link
+
+    @model_validator(mode="after")
+    def _interlocks_have_sources(self) -> "DevicesConfig":
+        names = [interlock.name for interlock in self.interlocks]
+        for index, interlock in enumerate(self.interlocks):
+            if interlock.name in names[:index]:
+                raise ValueError(f"interlocks.{index}.name: {interlock.name!r} is the name of two interlocks")
+            if self.board is None and isinstance(interlock, settings.BoardInputConfig):
+                raise ValueError(f"interlocks.{index}.driver: an input of the pump board, but no board is configured")
         return self
 
     @model_validator(mode="after")
@@ -103,6 +125,11 @@ class DevicesConfig(Section):
             raise ValueError("a camera needs a [devices.screen]; a folder of frames must not have one")
         return self
 
+    @property
+    def vent_fitted(self) -> bool:
+        """Whether there is a valve that lets gas out: a pump board drives one, single instruments may lack it."""
+        return self.board is not None or self.vent is not None
+
     def roles(self) -> dict[str, settings.AnyDriver]:
         """The filled roles; empty with a board."""
         return {role: section for role in ROLES if (section := getattr(self, role)) is not None}
@@ -111,6 +138,11 @@ class DevicesConfig(Section):
     def name(self) -> str:
         """For messages: the board's address, or each role's address."""
         return self.board or ", ".join(f"{role} on {address_of(section)}" for role, section in self.roles().items())
+
+
+def _port_of(link: str) -> str:
+    """Serial port of an RTU link; a TCP link as it is."""
+    return link.removeprefix("rtu://").partition("?")[0]
 
 
 def address_of(section: settings.AnyDriver) -> str:
@@ -224,6 +256,8 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
+        if self.devices is not None and (shared := device_places.find_shared(self.devices)):
+            raise ValueError(shared)
         if self.devices is not None and not (self.devices.board or self.devices.displacement or self.by_optics):
             raise ValueError(
                 'devices: no device for displacement; without a laser set estimator.process_value = "optics"'
@@ -237,6 +271,16 @@ class Config(Section):
             if bits != self.optics.camera.bits:
                 raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
         return self
+
+    @property
+    def interlocks(self) -> tuple[settings.InterlockDriver, ...]:
+        """The interlocks; bit i of `interlocks_open` is the i-th."""
+        return () if self.devices is None else self.devices.interlocks
+
+    @property
+    def vent_fitted(self) -> bool:
+        """Whether the bench has a vent; the twin, which serves if no devices are named, has one."""
+        return self.devices is None or self.devices.vent_fitted
 
     @property
     def by_optics(self) -> bool:

@@ -150,7 +150,8 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{field}: unknown key; {hint(key, [*fields], home and f'it belongs in [{home}]')}"
     inner = sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
     if kind.startswith("union_tag"):
-        tag, known = str(error["ctx"].get("tag", "")), [str(tag) for section in inner for tag in tags(section)]
+        choices = _sections_at(model, path)
+        tag, known = str(error["ctx"].get("tag", "")), [str(tag) for section in choices for tag in tags(section)]
         return f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; {hint(tag, known)}"
     message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
     if kind == "value_error":  # some begin with the key
@@ -211,6 +212,17 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list
         members = [] if field is None else sections(field.annotation)
         inside = members[0] if members else None
     return path, inside
+
+
+def _sections_at(model: type[BaseModel], path: list[int | str]) -> list[type[BaseModel]]:
+    """Return the sections that may stand at a path as in the file; of a list those of its entries."""
+    found: list[type[BaseModel]] = [model]
+    for name in path:
+        if isinstance(name, int):
+            continue
+        fields = [section.model_fields[name] for section in found if name in section.model_fields]
+        found = [inner for field in fields for inner in sections(field.annotation)]
+    return found
 
 
 def sections(annotation: Any) -> list[type[BaseModel]]:

@@ -92,6 +92,7 @@ class ConsoleView:
     too_tight: bool  # the leak is too small for the band
     gains: str  # in force, with the countdown of a trial
     flow_most_um_per_s: float  # with the curve in force
+    interlocks: tuple[str, ...]  # each open interlock with its text
     recording: str  # what prevents recording; empty if nothing does
     events: tuple[events.EventLine, ...]  # the last ones, oldest first
     shape: ShapeView
@@ -180,6 +181,7 @@ class ConsoleModel:
             too_tight=self._too_tight(now_s),
             gains=telemetry.gains_words(vars(in_force.loop), status.trial_left_s),
             flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
+            interlocks=status.interlock_lines,
             recording=status.recording_words,
             events=tuple(self._events),
             shape=self._shape(now_s),

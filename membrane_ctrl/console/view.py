@@ -204,6 +204,8 @@ def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]
     ):
         if label not in omitted:
             table.add_row(label, line)
+    for line in view.interlocks:
+        table.add_row("open", Text(line, style="bold yellow"))
     if view.recording:  # one line only: with a full disk every file reports an error
         table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table

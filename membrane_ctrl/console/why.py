@@ -13,6 +13,8 @@ _LEVELS = {
     SafeLevel.PUMP_OFF: "pump is off",
     SafeLevel.VENT: "pump is off and the vent is open",
 }
+_NO_VENT = "pump is off; no vent is fitted, the leak lowers the mirror"
+_VENT_SHUT = 0.5  # share of its command below which a vent's read-back contradicts it
 _STATES = {
     State.STANDBY: "pump is off: no hold was requested",
     State.CHECK: "pump is off until every sensor has been good for a while",
@@ -42,7 +44,7 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
     state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
     if safe_level != SafeLevel.NONE:
-        return f"{_LEVELS[safe_level]}: {fault or told or 'unknown fault'}"
+        return f"{_level_words(safe_level, row, config)}: {fault or told or 'unknown fault'}"
     if state in _STATES:
         return told or _STATES[state]
     sees = math.isfinite(row.displacement_um) or math.isfinite(row.estimate_sigma_um)
@@ -56,6 +58,17 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_outside(row)}"
     return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
+
+
+def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> str:
+    """What a safe level does on this bench."""
+    if safe_level != SafeLevel.VENT:
+        return _LEVELS[safe_level]
+    if not config.vent_fitted:
+        return _NO_VENT
+    if row.vent_readback_fraction < _VENT_SHUT * row.vent_fraction:
+        return f"pump is off; the vent is commanded open, but its read-back is {percent(row.vent_readback_fraction)}"
+    return _LEVELS[safe_level]
 
 
 def go_on(row: TelemetryRow, told: str, ctl: str, keys: bool, locks: Sequence[Lock] = (), latched: str = "") -> str:

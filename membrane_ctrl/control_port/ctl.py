@@ -100,7 +100,8 @@ def fleet_line(status: dict[str, Any]) -> str:
     if "problem" in status:
         return f"{'no contact':10}{'':14}{status['problem']}"
     row, fault = status.get("row") or {}, status.get("fault")
-    notices = [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    parts = ("interlocks", "maintenance", "recording")
+    notices = [str(each) for part in parts for each in status.get(part, {}).values()]
     words = [f"LOCKED {line}" for line in lock_lines(status)]
     words += [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
     words += notices or [str(status.get("why") or "as it should be")]
@@ -137,6 +138,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
     lines += [f"LOCKED {line}" for line in lock_lines(status)]
     if fault:
         lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
+    lines += [f"OPEN {message}" for message in status.get("interlocks", {}).values()]
     if row:
         shown = {
             "setpoint": ("setpoint_um", "um"),

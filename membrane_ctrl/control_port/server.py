@@ -369,6 +369,7 @@ def status_table(status: telemetry.RunStatus) -> dict[str, Any]:
         "shape_reason": status.shape_reason,
         "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,
         "geometry": asdict(geometry) if geometry else None,
+        "interlocks": dict(zip(status.interlocks, status.interlock_lines, strict=True)),
         "maintenance": dict(status.maintenance),
         "recording": dict(status.recording),
         "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},

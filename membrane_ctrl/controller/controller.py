@@ -12,7 +12,16 @@ from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import machine, trial
-from membrane_ctrl.controller import commands, locks, pump_obeys, safe_levels, safety, sensor_consistency, states
+from membrane_ctrl.controller import (
+    commands,
+    interlocks,
+    locks,
+    pump_obeys,
+    safe_levels,
+    safety,
+    sensor_consistency,
+    states,
+)
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.controller.scene import Scene, obey, telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
@@ -42,8 +51,9 @@ class Controller:
         observer = Observer(config)
         loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator)
         levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
+        circuits = interlocks.Interlocks(config.interlocks)
         self._scene = Scene(
-            config, config.loop, config.pump, loop, observer, levels, standstill, config.loop.setpoint_um
+            config, config.loop, config.pump, loop, observer, levels, standstill, circuits, config.loop.setpoint_um
         )
         self._resume = safe_levels.ResumeRule(config.resume, config.limits)
         self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s, config.pump)
@@ -104,6 +114,9 @@ class Controller:
             gas_excess=consistency.gas_excess,
             optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
+            open_interlocks=scene.interlocks.judged_mask,
+            interlock_level=scene.interlocks.safe_level,
+            interlock_words=scene.interlocks.describe_open(scene.interlocks.judged_mask),
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
@@ -157,6 +170,7 @@ class Controller:
         if math.isnan(self._state_since_s):  # the state's first tick
             self._state_since_s = inputs.now_s
         scene.state_age_s = inputs.now_s - self._state_since_s
+        events += scene.interlocks.look(inputs.reading, self.state)
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
         for command in commands.in_order(inputs.commands):
@@ -233,6 +247,8 @@ class Controller:
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
+        if command.kind == "hold" and self.state == State.STANDBY and scene.interlocks.last_mask:
+            return f"{scene.interlocks.describe_open(scene.interlocks.last_mask)}; close it first"
         if command.kind in ("manual", "tune") and scene.levels.safe_level != SafeLevel.NONE:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
@@ -298,10 +314,10 @@ class Controller:
                 events.append(told.Cleared(self.fault.name if self.fault else ""))
                 self.fault = None
             return
-        if self.fault is None or (rule.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
+        if self.fault is None or (verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
             self.fault = rule
-            events.append(rule.fault(verdict.seen))
-        levels.enter(rule.safe_level, scene.now_s)
+            events.append(rule.fault(verdict.seen, verdict.safe_level))
+        levels.enter(verdict.safe_level, scene.now_s)
         if levels.step(scene.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 

@@ -14,10 +14,10 @@ from pydantic import BaseModel
 
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchIdentity
-from firmware_iface.settings import VaisalaPtb330Config
+from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control import gas
-from membrane_ctrl.controller import cross_check_plant, pump_obeys, safety
+from membrane_ctrl.controller import cross_check_interlocks, cross_check_plant, pump_obeys, safety
 from membrane_ctrl.model.errors import FindingsError
 
 _RESUMES_MOST = 24  # a day: the cause of a fault that recurs more than once an hour is not temporary
@@ -40,7 +40,12 @@ def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cro
     if not say.found:  # the others compute with the values
         for judge in _RULES:
             judge(config, say)
-        for judge_board in (cross_check_plant.judge_ranges, _board, _board_guards):
+        for judge_board in (
+            cross_check_plant.judge_ranges,
+            cross_check_interlocks.judge_interlock_board,
+            _board,
+            _board_guards,
+        ):
             judge_board(config, board or _UNKNOWN, say)
     return tuple(sorted(say.found, key=lambda finding: finding.severity))
 
@@ -142,6 +147,9 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
         if not isinstance(section, VaisalaPtb330Config):  # read in the background
             line = str(getattr(section, "link", None) or getattr(section, "port", ""))
             lines[line].append((f"devices.{role}.timeout_s", section.timeout_s))
+    for index, interlock in enumerate(devices.interlocks):  # read in the background, but a serial line has one turn
+        if isinstance(interlock, ModbusInputConfig) and interlock.link.startswith("rtu:") and interlock.link in lines:
+            lines[interlock.link].append((f"devices.interlocks.{index}.timeout_s", interlock.timeout_s))
     slowest = max(lines.values(), key=lambda line: sum(timeout_s for _, timeout_s in line))
     yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
 
@@ -242,6 +250,8 @@ _RULES = (
     cross_check_plant.judge_film,
     cross_check_plant.judge_alarms,
     cross_check_plant.judge_pump,
+    cross_check_plant.judge_vent,
+    cross_check_interlocks.judge_interlocks,
     cross_check_plant.judge_loop,
     cross_check_plant.judge_shape,
     cross_check_plant.judge_optics,

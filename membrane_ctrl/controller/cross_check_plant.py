@@ -100,6 +100,37 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
             say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
 
 
+def judge_vent(config: Config, say: ConfigFindings) -> None:
+    """Report what a bench without a vent cannot do, and how long its mirror takes to go down."""
+    if config.vent_fitted:
+        return
+    why = "no vent is fitted: the safe level vent, and `ctl vent`, only stop the pump"
+    remedy = "fit a vent; for a better estimate set twin.leak_time_constant_s to your mirror's"
+    say.warn(True, "devices.vent", f"{why}, and the leak alone lowers the mirror{_leak_estimate(config)}", remedy)
+
+
+def _leak_estimate(config: Config) -> str:
+    """How long the leak takes to lower the mirror, and on what basis; empty for a film that is slack already.
+
+    The outflow is proportional to the pressure p, and the volume to its cube root (a Hencky bowl). So
+    dp/dt = -(p / T) (p / p0)^(2/3), with the time constant T at p0, and p reaches p1 after
+    1.5 T ((p0 / p1)^(2/3) - 1).
+    """
+    mirror, end_pa, time_constant_s = (
+        config.optics.mirror,
+        config.states.vented_pressure_pa,
+        config.twin.leak_time_constant_s,
+    )
+    if not mirror.pressure_pa > end_pa > 0.0:
+        return ""
+    takes_s = 1.5 * time_constant_s * ((mirror.pressure_pa / end_pa) ** (2 / 3) - 1.0)
+    speed_um_per_s = 1e3 * mirror.sag_mm / (3.0 * time_constant_s)
+    return (
+        f", from {mirror.pressure_pa:g} to {end_pa:g} Pa in about {takes_s / 3600.0:.2g} h (estimated with "
+        f"twin.leak_time_constant_s = {time_constant_s:g} s, which is a leak of {speed_um_per_s:.2g} um/s)"
+    )
+
+
 def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
     """What is wrong with the gains of a loop on the nominal pump, if anything."""
     sensitivity = pid.peak_sensitivity(loop)

@@ -65,8 +65,8 @@ VENTED_FRACTION = 0.5
 class ResumeRule:
     """Whether a latched fault may clear automatically: only a listed one, its cause absent, a limited number a day.
 
-    Never after a vent, a board latch other than the watchdog's, a board taken by another program, or a person's lock:
-    any of these during the fault decides, whatever the first cause.
+    Never after a vent, a board latch other than the watchdog's, a board taken by another program, a person's lock, or
+    an open interlock: any of these during the fault decides, whatever the first cause.
     """
 
     def __init__(self, config: ResumeConfig, limits: LimitsConfig) -> None:
@@ -126,5 +126,6 @@ def _decides(levels: SafeLevels, observation: Observation) -> bool:
         or bool(observation.board_faults & ~WATCHDOG_MASK)
         or observation.vent_fraction > VENTED_FRACTION
         or bool(observation.locked)
+        or observation.open_interlocks != 0
         or bool(observation.foreign)
     )

@@ -18,6 +18,7 @@ MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State
 HOLDING = frozenset({State.HOLD})
 STANDING = HOLDING | {State.SETTLE}  # the mirror is at its setpoint
 CONNECTED = MOVING | {State.CHECK}
+GAS_MOVES = CONNECTED | {State.LOWER}
 ALWAYS = frozenset(State)
 NOT_YET_FAULT = ALWAYS - {State.FAULT}
 
@@ -57,6 +58,9 @@ class Observation:
     guard_um: float = math.nan  # the displacement by the laser, or by the optics where they may replace it
     laser_stuck: bool = False  # it repeats one value to the last bit
     gas_excess: str = ""  # excess gas the film takes, unless an independent sensor shows it standing still
+    open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
+    interlock_level: SafeLevel = SafeLevel.NONE  # the deepest level of the open ones
+    interlock_words: str = ""  # the open ones with their texts
 
     @property
     def depth_um(self) -> float:
@@ -69,7 +73,8 @@ class Rule:
     """One row of the table. `limit` and `remedy` are for people; `broken` decides.
 
     The window skips ticks in which `unseen` is true: ticks without an answer must not excuse a sensor that exceeds
-    its limit whenever it answers.
+    its limit whenever it answers. `deepens` gives a level deeper than `safe_level` where what is observed demands it,
+    and `enters` describes the level to people who read the table.
     """
 
     code: int
@@ -85,6 +90,12 @@ class Rule:
     # `resume.faults` may name it: a lost message or sensor whose return is visible. All others need a person.
     may_resume: bool = False
     unseen: Callable[[Observation], bool] = lambda o: False
+    deepens: Callable[[Observation], SafeLevel] = lambda o: SafeLevel.NONE
+    enters: str = ""  # empty: always `safe_level`
+
+    def level_of(self, observation: Observation) -> SafeLevel:
+        """The safe level that the rule enters if it trips on this observation."""
+        return max(self.safe_level, self.deepens(observation))
 
     @property
     def needed(self) -> int:
@@ -101,15 +112,15 @@ class Rule:
         """Whether the fault stays until acknowledged."""
         return self.safe_level > SafeLevel.HOLD_FLOW
 
-    def fault(self, seen: str) -> Fault:
-        """The event of a tripped rule, with the observed value in words."""
+    def fault(self, seen: str, safe_level: SafeLevel) -> Fault:
+        """The event of a tripped rule, with the observed value in words and the level that it enters."""
         return Fault(
             code=self.code,
             name=self.name,
             cause=self.cause,
             seen=seen,
             limit=self.limit,
-            safe_level=self.safe_level.name.lower(),
+            safe_level=safe_level.name.lower(),
             latching=self.latching,
             remedy=self.remedy,
         )
@@ -156,6 +167,13 @@ TABLE: tuple[Rule, ...] = (
         limit="ctl unlock", safe_level=SafeLevel.PUMP_OFF, states=CONNECTED | {State.FAULT},
         remedy="ask the person who locked it whether the mirror may move, then `ctl unlock`",
         seen=lambda o: o.locked, broken=lambda o, c: bool(o.locked),
+    ),
+    Rule(  # 1 of 1: an open circuit is a demand to stop. A bouncing contact is to be filtered in its own hardware
+        code=60, name="interlock_open", cause="the circuit of an interlock is open, or its signal is lost",
+        limit="devices.interlocks", safe_level=SafeLevel.RAMP_DOWN, states=GAS_MOVES | {State.FAULT},
+        remedy="follow the interlock's text, close its circuit, then acknowledge the fault",
+        seen=lambda o: o.interlock_words, broken=lambda o, c: o.open_interlocks != 0,
+        deepens=lambda o: o.interlock_level, enters="its own: ramp_down, pump_off or vent",
     ),
     Rule(
         code=50, name="tick_error", cause="the control code raised an error",
@@ -321,6 +339,7 @@ class Verdict:
 
     rule: Rule | None
     seen: str = ""
+    safe_level: SafeLevel = SafeLevel.NONE  # that it enters
 
 
 class SafetyTable:
@@ -336,6 +355,7 @@ class SafetyTable:
         Returning simply the first would let a lost laser, which only holds the flow, hide a lost pressure sensor.
         """
         tripped: Rule | None = None
+        deepest = SafeLevel.NONE
         for index, rule in enumerate(self._table):
             if state not in rule.states:
                 self._history[index] = 0
@@ -347,6 +367,7 @@ class SafetyTable:
                 continue
             history = ((self._history[index] << 1) | broken) & ((1 << rule.window) - 1)
             self._history[index] = history
-            if history.bit_count() >= rule.needed and (tripped is None or rule.safe_level > tripped.safe_level):
-                tripped = rule
-        return Verdict(tripped, tripped.seen(observation) if tripped else "")
+            safe_level = rule.level_of(observation)
+            if history.bit_count() >= rule.needed and safe_level > deepest:
+                tripped, deepest = rule, safe_level
+        return Verdict(tripped, tripped.seen(observation) if tripped else "", deepest)

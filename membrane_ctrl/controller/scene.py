@@ -10,7 +10,7 @@ from membrane_ctrl.control import filters, inner_loop, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.machine import Finished
 from membrane_ctrl.control.experiments.trial import Trial
-from membrane_ctrl.controller import commands, pump_obeys, safe_levels, safety, tick
+from membrane_ctrl.controller import commands, interlocks, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
@@ -43,6 +43,7 @@ class Scene:
     observer: Observer
     levels: safe_levels.SafeLevels
     standstill: pump_obeys.Standstill
+    interlocks: interlocks.Interlocks
     setpoint_um: float
     # this tick
     now_s: float = 0.0
@@ -199,5 +200,11 @@ def telemetry_row(
         trim_um=shape.trim_um,
         truth_displacement_um=inputs.truth_displacement_um,
         truth_laser_bias_um=inputs.truth_laser_bias_um,
+        interlocks_open=_interlocks_open(scene.interlocks),
         **seen,
     )
+
+
+def _interlocks_open(found: interlocks.Interlocks) -> float:
+    """The mask for the record; NaN without interlocks, and in a tick without a reading."""
+    return float(found.open_mask) if found.any_configured and found.seen else math.nan

@@ -19,6 +19,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 _LOCKS_SHOWN = 3  # in the operator's line; the status has all of them
 # by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
 _PUMP_STANDS_S = 0.5
+_NO_VENT = "no vent is fitted, the leak lowers the mirror"
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
 # A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded off, report that
 # the pump still runs. Shorter than the 30 s that the service manager allows.
@@ -26,15 +27,18 @@ _STOP_GIVES_UP_S = 10.0
 
 
 def standby(scene: Scene) -> State:
-    """Keep the pump off until someone requests a hold, and no lock forbids it."""
+    """Keep the pump off until someone requests a hold; a lock or an open interlock cancels the request."""
+    interlock = scene.interlocks.describe_open(scene.interlocks.last_mask)
     if scene.locks:
         scene.hold_wanted = False
         scene.why = f"standby: locked: {describe_locks(scene.locks, _LOCKS_SHOWN)}"
         return State.STANDBY
+    if interlock:
+        scene.hold_wanted = False
     if scene.hold_wanted:
         scene.why = "a hold was requested"
         return State.CHECK
-    scene.why = "standby: no hold was requested"
+    scene.why = f"standby: {interlock or 'no hold was requested'}"
     if scene.latched:
         scene.why = f"standby: a fault is latched: {scene.latched}"
     return State.STANDBY
@@ -175,8 +179,9 @@ def lower(scene: Scene) -> State:
     if scene.venting:
         reading = scene.observer.reading
         pressure_pa = reading.gauge_pressure_pa if reading else math.nan
-        scene.why = f"venting: {pressure_pa:.0f} Pa left"
-        if scene.state_age_s > _VENTED_S:
+        vented = scene.config.vent_fitted
+        scene.why = f"{'venting' if vented else _NO_VENT}: {pressure_pa:.0f} Pa left"
+        if vented and scene.state_age_s > _VENTED_S:
             scene.why += f" after {scene.state_age_s / 60:.0f} min: check the vent and the gauge"
         if not pressure_pa < scene.config.states.vented_pressure_pa:
             return State.LOWER
@@ -189,7 +194,7 @@ def lower(scene: Scene) -> State:
 def fault(scene: Scene) -> State:
     """Descend the safe levels, latched; a person clears the fault, or the resume rule once its cause has gone."""
     safe_level = scene.levels.step(scene.now_s)
-    scene.why = f"fault: {safe_level.name.lower().replace('_', ' ')}"
+    scene.why = f"fault: {_level_words(safe_level, scene)}"
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting or safe_level == SafeLevel.VENT)
     if safe_level == SafeLevel.RAMP_DOWN:
@@ -212,6 +217,13 @@ def fault(scene: Scene) -> State:
     if may_end and (stand.at_rest or silent or _nothing_left_to_do(scene, safe_level)):
         scene.finished = Exit.SAFETY_TRIP
     return State.FAULT
+
+
+def _level_words(safe_level: SafeLevel, scene: Scene) -> str:
+    """The safe level for people, by what the bench can do."""
+    if safe_level == SafeLevel.VENT and not scene.config.vent_fitted:
+        return f"pump off; {_NO_VENT}"
+    return safe_level.name.lower().replace("_", " ")
 
 
 def _nothing_left_to_do(scene: Scene, safe_level: SafeLevel) -> bool:
@@ -345,7 +357,7 @@ def _missing(scene: Scene) -> str:
         return "no gauge pressure"
     if reading.latched_faults:
         return f"the board has latched faults {reading.latched_faults:#x}"
-    return ""
+    return scene.interlocks.describe_open(scene.interlocks.open_mask)
 
 
 def _why_hold(scene: Scene, output: inner_loop.LoopOutput) -> str:

@@ -61,11 +61,11 @@ class TickOutputs:
 
 # First bytes of the inputs ring's messages.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
-MESSAGE_BYTES = 512  # a slot of the ring: a tick takes 492; longer commands come in pieces
+MESSAGE_BYTES = 640  # a slot of the ring: a tick takes some 520; longer commands come in pieces
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
-    "foreign": "u1", "interlock_inputs": "i8",
+    "foreign": "u1", "interlock_inputs": "i8", "interlocks_open": "i8",
 }  # fmt: skip
 _READING = tuple(field.name for field in fields(BenchReading))
 _LINK_UP, _HAS_READING = 1, 2
@@ -94,10 +94,13 @@ _LETTERS = {"<i8": "q", "<f8": "d", "|u1": "B", "<u4": "I"}
 _STRUCT = struct.Struct("<" + "".join(_LETTERS[RECORD[name].str] for name in RECORD.names or ()))
 assert _STRUCT.size == RECORD.itemsize
 _ROW_PLACE = len(TICK) + RECORD.itemsize
+assert _ROW_PLACE + telemetry.ROW_BYTES <= MESSAGE_BYTES
 # Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
-_NO_ESTIMATE = struct.pack("<d", math.nan) * ((telemetry.ROW_BYTES - telemetry.FIRST_BYTES) // 8)
+# What rows hold in the fields that earlier versions did not have, unless these say something
+_NO_ESTIMATE = struct.pack("<d", math.nan) * ((telemetry.SECOND_BYTES - telemetry.FIRST_BYTES) // 8)
+_NO_INTERLOCKS = struct.pack("<d", math.nan) * ((telemetry.ROW_BYTES - telemetry.SECOND_BYTES) // 8)
 _NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
 
 
@@ -142,8 +145,7 @@ def _pieces(kind: bytes, data: bytes) -> list[bytes]:
 
 def output_crc(outputs: TickOutputs, row: bytes) -> int:
     """Checksum of all outputs of a tick: command and row, events, end."""
-    no_estimate = row[telemetry.FIRST_BYTES :] == _NO_ESTIMATE
-    crc = zlib.crc32(row[: telemetry.FIRST_BYTES] if no_estimate else row)  # as before the estimate existed
+    crc = zlib.crc32(_as_in_earlier_versions(row))
     if outputs.events or outputs.finished is not None or outputs.answers or outputs.clear_mask:
         # a truth value, as before the mask existed: replays of older runs still give the same checksum
         rest = [outputs.events, outputs.finished, outputs.answers, outputs.clear_mask != 0]
@@ -152,6 +154,15 @@ def output_crc(outputs: TickOutputs, row: bytes) -> int:
             text = text.replace(f" {name}=", f" {former}=")
         crc = zlib.crc32(text.encode(), crc)
     return crc
+
+
+def _as_in_earlier_versions(row: bytes) -> bytes:
+    """The row without trailing fields that say nothing: as it was before these fields existed."""
+    if row[telemetry.SECOND_BYTES :] == _NO_INTERLOCKS:
+        row = row[: telemetry.SECOND_BYTES]
+        if row[telemetry.FIRST_BYTES :] == _NO_ESTIMATE:
+            row = row[: telemetry.FIRST_BYTES]
+    return row
 
 
 def _tail(inputs: TickInputs) -> bytes:

@@ -59,6 +59,7 @@ _TEXTS = (
     Published("run", "", "name of the run"),
     Published("fault", "", "the fault with its cause and remedy; empty without one"),
     Published("locks", "", "the locks: text, author, time and word of each; empty without one"),
+    Published("interlocks", "", "the open interlocks with their texts; empty without one"),
     Published("notices", "", "maintenance notices, and what fails in the recording"),
     Published("figure_verdict", "", "verdict on the newest figure"),
     Published("answer", "", "what became of the last command of any door"),
@@ -80,6 +81,7 @@ def values(seen: HoldSeen) -> dict[str, Value]:
         "why": str(status.get("why") or "as it should be"),
         "fault": "{code} {name}: {cause}; {remedy}".format_map(fault) if fault else "",
         "locks": "; ".join(lock_lines(status)),
+        "interlocks": "; ".join(str(each) for each in status.get("interlocks", {}).values()),
         "notices": "; ".join(notices),
     }
     found |= {each.name: row.get(each.name) for each in _TICK}

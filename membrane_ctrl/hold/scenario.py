@@ -26,9 +26,14 @@ from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun
 from membrane_ctrl.run_files.run_folder import create_run_folder
-from membrane_ctrl.sim import plant, surroundings, virtual_bench
+from membrane_ctrl.sim import plant, surroundings, virtual_bench, virtual_interlocks
 
 _SWITCHES: dict[str, Any] = {field.name: field.default for field in fields(virtual_bench.Wrong)}
+# Switches of one interlock, which the key `interlock` names
+_INTERLOCK_SWITCHES: dict[str, Callable[[virtual_interlocks.VirtualInterlocks], set[str]]] = {
+    "interlock_open": lambda interlocks: interlocks.open_names,
+    "interlock_lost": lambda interlocks: interlocks.lost_names,
+}
 _FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
 _REPEATS_MAX = 100_000
 _AFTERMATH_S = 60.0  # a run whose process stands still never ends by itself
@@ -54,6 +59,7 @@ class At(Section):
     wrong: str | None = None
     for_s: Annotated[float, Field(gt=0)] | None = None
     every_s: Annotated[float, Field(ge=1e-3)] | None = None
+    interlock: str | None = None  # that `wrong` opens or loses
     event: Happening | None = None
     over_s: Annotated[float, Field(ge=0)] = 0.0
     command: str | None = None
@@ -64,8 +70,11 @@ class At(Section):
     def _one_thing(self) -> At:
         if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
             raise ValueError("give exactly one of wrong, event and command")
-        if self.wrong is not None and self.wrong not in _SWITCHES:
-            raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {', '.join(_SWITCHES)}")
+        if self.wrong is not None and self.wrong not in _SWITCHES and self.wrong not in _INTERLOCK_SWITCHES:
+            known = ", ".join((*_SWITCHES, *_INTERLOCK_SWITCHES))
+            raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {known}")
+        if (self.wrong in _INTERLOCK_SWITCHES) != (self.interlock is not None):
+            raise ValueError(f"interlock goes with {' and '.join(_INTERLOCK_SWITCHES)}: the name of one")
         if self.wrong in _FRACTIONS and not 0 <= self.value <= 1:
             raise ValueError(f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1")
         if self.for_s is not None and self.wrong is None:
@@ -91,7 +100,11 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _before_the_end(self) -> Scenario:
+        names = [interlock.name for interlock in self.config.interlocks]
         for number, at in enumerate(self.at):
+            if at.interlock is not None and at.interlock not in names:
+                known = ", ".join(names) or "none: add [[config.devices.interlocks]]"
+                raise ValueError(f"at.{number}: interlock = {at.interlock!r} is not configured; known: {known}")
             if at.time_s >= self.duration_s:
                 raise ValueError(
                     f"at.{number}: time_s = {at.time_s:g} is not before duration_s = {self.duration_s:g}"
@@ -123,7 +136,11 @@ class ScenarioRun:
         mirror = plant.Plant(
             config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE)
         )
-        self.bench = virtual_bench.VirtualBench(mirror, config.devices.watchdog_s if config.devices else 0.5)
+        self.bench = virtual_bench.VirtualBench(
+            mirror,
+            config.devices.watchdog_s if config.devices else 0.5,
+            interlocks=virtual_interlocks.VirtualInterlocks(config.interlocks),
+        )
         shape = TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
         self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
         self._ends_s = scenario.duration_s
@@ -158,10 +175,14 @@ def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
             yield at.time_s, command
         elif at.wrong is not None:
             times = 1 if at.every_s is None else max(1, math.ceil((end_s - at.time_s) / at.every_s))
+            if at.interlock is not None:
+                wrong, right = (_switch_interlock(at.wrong, at.interlock, on) for on in (at.value != 0, False))
+            else:
+                wrong, right = _switch(at.wrong, at.value), _switch(at.wrong, _SWITCHES[at.wrong])
             for begin_s in (at.time_s + k * (at.every_s or 0.0) for k in range(times)):
-                yield begin_s, _switch(at.wrong, at.value)
+                yield begin_s, wrong
                 if at.for_s is not None:
-                    yield begin_s + at.for_s, _switch(at.wrong, _SWITCHES[at.wrong])
+                    yield begin_s + at.for_s, right
         elif at.event == "power_cycle":
             yield at.time_s, virtual_bench.VirtualBench.power_cycle
 
@@ -169,6 +190,17 @@ def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
 def _switch(name: str, value: Any) -> Callable[[virtual_bench.VirtualBench], None]:
     kind = type(_SWITCHES[name])
     return lambda bench: setattr(bench.wrong, name, kind(value))
+
+
+def _switch_interlock(switch: str, name: str, on: bool) -> Callable[[virtual_bench.VirtualBench], None]:
+    def act(bench: virtual_bench.VirtualBench) -> None:
+        names = _INTERLOCK_SWITCHES[switch](bench.interlocks)
+        if on:
+            names.add(name)
+        else:
+            names.discard(name)
+
+    return act
 
 
 _ROUND_S = 20.0  # of the run, between two rounds of the recorder

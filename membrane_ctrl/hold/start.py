@@ -20,20 +20,21 @@ from functools import partial
 from pathlib import Path
 
 from firmware_iface.drivers.pump_board import NO_CLAIM
-from firmware_iface.roles import ALL_FAULTS, Bench, LinkError
+from firmware_iface.roles import ALL_FAULTS, Bench, BenchReading, LinkError
+from firmware_iface.settings import GpioLineConfig
 from membrane_ctrl.alarms.process import require_sendable
-from membrane_ctrl.config.schema import Config, RecordingConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.control_port import server, sockets
-from membrane_ctrl.controller import commands, cross_check, safe_levels, tick
+from membrane_ctrl.controller import commands, cross_check, interlocks, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench
+from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench, require_places
 from membrane_ctrl.instruments.lock_store import LockStore, device_keys, require_unlocked
-from membrane_ctrl.model import errors, events, run_events, terminal
+from membrane_ctrl.model import errors, events, run_events, telemetry, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.processes import child, ring
@@ -76,7 +77,7 @@ def hold_mirror(options: HoldOptions) -> int:
     for warning in cross_check.require_sound(options.config, options.source):
         print(warning.line(options.source), file=sys.stderr)
     if options.config.devices is not None and (options.lab or not options.twin):
-        open_bench(options.config.devices)  # impossible settings end here, before anything is started
+        _require_possible(options.config.devices, options.lab)
     require_sendable(options.config.alarms)
     if options.config.web is not None and importlib.util.find_spec("nicegui") is None:
         raise errors.InputError("[web] needs NiceGUI: pip install 'membrane-ctrl[web]'")
@@ -118,6 +119,17 @@ def hold_mirror(options: HoldOptions) -> int:
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
         report(run_dir, options.json)
     return exit_code
+
+
+def _require_possible(devices: DevicesConfig, lab: bool) -> None:
+    """End with InputError for impossible settings, before anything is started.
+
+    An emulated lab needs no package for GPIO: it stands for these lines by a Modbus module.
+    """
+    gpio = tuple(found for found in devices.interlocks if isinstance(found, GpioLineConfig))
+    emulated = tuple(found for found in devices.interlocks if found not in gpio) if lab else devices.interlocks
+    require_places(devices)
+    open_bench(devices.model_copy(update={"interlocks": emulated}))
 
 
 def _autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
@@ -188,6 +200,8 @@ async def _identify(
         if options.clear_faults:
             await bench.clear_faults(ALL_FAULTS)
         reading = await bench.read()
+        if not options.standby:
+            _require_closed(config, reading)
         faults = reading.latched_faults
         if not faults:
             return BoardAtStart()
@@ -204,6 +218,16 @@ async def _identify(
     if not options.standby:
         raise errors.DeviceError(f"{what}; find the cause, then start with --clear-faults")
     return BoardAtStart(latched=what)
+
+
+def _require_closed(config: Config, reading: BenchReading) -> None:
+    """Refuse a start that would hold the mirror while an interlock is open. Raises DeviceError."""
+    circuits = interlocks.Interlocks(config.interlocks)
+    circuits.look(reading, telemetry.State.STANDBY)
+    if circuits.open_mask:
+        raise errors.DeviceError(
+            f"{circuits.describe_open(circuits.open_mask)}; close it, or start with --standby and hold later"
+        )
 
 
 def _may_resume(name: str, config: Config, resumes: latched_fault.ResumeLog | None) -> bool:
@@ -294,13 +318,13 @@ def _wiring(
     stack: contextlib.ExitStack,
 ) -> Wiring:
     """What the tick reads and writes, without listeners; the rings are closed with the stack."""
-    telemetry, events, inputs = (
+    rows, events, inputs = (
         stack.enter_context(contextlib.closing(ring.RingWriter(address)))
         for address in (rings.telemetry, rings.events, rings.inputs)
     )
     shapes = stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))) if rings.shapes else None
     truth = twin.truth_reader() if twin else None
-    return Wiring(bench, telemetry, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports)
+    return Wiring(bench, rows, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports)
 
 
 def _ask_first(

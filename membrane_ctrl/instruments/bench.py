@@ -7,11 +7,11 @@ import ipaddress
 import os
 import socket
 import struct
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Hashable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from firmware_iface import drivers, role_bench, roles, settings
+from firmware_iface import drivers, interlocks, role_bench, roles, settings
 from firmware_iface.drivers import bronkhorst, bronkhorst_propar, modbus_map
 from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.mks_937b import Mks937b
@@ -20,8 +20,9 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.links import modbus_rtu, serial_port
-from membrane_ctrl.config import toml_file
+from membrane_ctrl.config import device_places, toml_file
 from membrane_ctrl.config.schema import DevicesConfig
+from membrane_ctrl.instruments import interlock_sources
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.terminal import one_line
 
@@ -38,12 +39,12 @@ _SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
 }
 
 
-def role_devices(devices: DevicesConfig) -> role_bench.RoleDevices:
+def role_devices(devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None) -> role_bench.RoleDevices:
     """The drivers named in the tables, not yet connected; those on one serial bus share it.
 
     Raises InputError for a port, URL, preset or setting that the driver does not accept.
     """
-    links = modbus_rtu.ModbusLinks()
+    links = links or modbus_rtu.ModbusLinks()
     made: dict[str, Any] = {"displacement": None}  # a bench held by its optics may have none
     for role, section in devices.roles().items():
         try:
@@ -118,17 +119,58 @@ T = TypeVar("T")
 
 def open_bench(devices: DevicesConfig) -> roles.Bench:
     """The configured bench, not yet connected. Raises InputError for impossible devices."""
+    require_places(devices)
+    links = modbus_rtu.ModbusLinks()
+    made: roles.Bench
     if devices.board is None:
-        return role_bench.RoleBench(role_devices(devices), devices.watchdog_s)
-    return pump_board(devices, devices.board)
+        made = role_bench.RoleBench(role_devices(devices, links), devices.watchdog_s)
+    else:
+        made = pump_board(devices, devices.board, links)
+    if not devices.interlocks:
+        return made
+    return interlocks.InterlockBench(made, board_inputs(devices), interlock_sources.polled_sources(devices, links))
 
 
-def pump_board(devices: DevicesConfig, url: str) -> PumpBoard:
+def pump_board(devices: DevicesConfig, url: str, links: modbus_rtu.ModbusLinks | None = None) -> PumpBoard:
     """The board at this URL, not yet connected. Raises InputError."""
     try:
-        return PumpBoard(url, devices.unit_id, devices.timeout_s, devices.watchdog_s)
+        link = (links or modbus_rtu.ModbusLinks()).link(url, devices.unit_id, devices.timeout_s)
+        return PumpBoard(url, devices.unit_id, devices.timeout_s, devices.watchdog_s, link)
     except ValueError as error:
         raise InputError(f"devices.board: {error}") from None
+
+
+def board_inputs(devices: DevicesConfig) -> dict[int, int]:
+    """By interlock, the input of the board that it is wired to."""
+    return {
+        index: interlock.input
+        for index, interlock in enumerate(devices.interlocks)
+        if isinstance(interlock, settings.BoardInputConfig)
+    }
+
+
+def require_places(devices: DevicesConfig) -> None:
+    """Refuse two roles on one place, also if their links are spelt differently. Raises InputError."""
+    shared = device_places.find_shared(devices, _device_of_link)
+    if shared:
+        raise InputError(shared)
+    ports: dict[str, tuple[str, str]] = {}
+    for role, port, link in devices.list_ports():
+        other, other_link = ports.setdefault(_serial_name(port), (role, link))
+        if other != role and not (link and link == other_link):
+            raise InputError(
+                f"devices.{other} and devices.{role} name the same port, {port}; only Modbus devices on one link may "
+                "share it"
+            )
+
+
+def _device_of_link(link: str) -> Hashable:
+    """One value for all spellings of a link: of a TCP link the host's addresses, else the serial port or file."""
+    plain = device_places.plain_link(link)
+    if isinstance(plain, tuple):
+        host, port = plain
+        return frozenset(_addresses(host)), port
+    return _serial_name(str(plain))
 
 
 async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIdentity:
@@ -191,15 +233,23 @@ def locked(devices: Iterable[str]) -> Iterator[None]:
 
 def device_names(devices: DevicesConfig) -> set[str]:
     """Canonical names of the configured devices on this machine, however spelt."""
+    names = {_serial_name(port) for port in _interlock_ports(devices)}
     if devices.board is not None:
-        return modbus_names(devices.board, devices.unit_id)
-    names: set[str] = set()
+        return names | modbus_names(devices.board, devices.unit_id)
     for section in devices.roles().values():
         if isinstance(section, settings.ON_MODBUS):
             names |= modbus_names(section.link, section.unit_id)
         else:
             names.add(_serial_name(section.port))
     return names
+
+
+def _interlock_ports(devices: DevicesConfig) -> Iterator[str]:
+    """Yield the serial ports of interlocks. An input module in the network may serve several benches."""
+    for interlock in devices.interlocks:
+        if isinstance(interlock, settings.ModbusInputConfig) and interlock.link.startswith("rtu:"):
+            port, _ = modbus_rtu.parse_rtu_url(interlock.link)
+            yield port
 
 
 def modbus_names(url: str, unit_id: int) -> set[str]:

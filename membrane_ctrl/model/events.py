@@ -175,6 +175,20 @@ class MaintenanceOver(Event, kind="maintenance_over"):
     message: str
 
 
+class InterlockOpened(Event, kind="interlock_opened"):
+    """The circuit of an interlock opened, or its signal was lost; `text` is the configuration's, for people."""
+
+    name: str
+    text: str
+    safe_level: str
+
+
+class InterlockClosed(Event, kind="interlock_closed"):
+    """The circuit of an interlock is closed again."""
+
+    name: str
+
+
 # Events as sentences for people: what happened, where, and what to do; one wording for every timeline.
 
 # A part in brackets is left out if one of its fields is empty.
@@ -199,6 +213,8 @@ _SENTENCES = {
     "maintenance": "Maintenance {name}: {message}",
     "vibrations": "Vibrations of the mirror: {message}",
     "maintenance_over": "Maintenance {name} is over: {message}",
+    "interlock_opened": "Interlock {name} is open[: {text}]",
+    "interlock_closed": "Interlock {name} is closed",
     "held_by": "The mirror is held by {sensors}[; jumped: {jumped}]",
     "pump": "The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop reckons with {correction:.3f}",
     "link": "Link to the pump board: {message}",
@@ -231,7 +247,7 @@ _ERRORS = frozenset(
 )
 _WARNINGS = frozenset({
     "disk_low", "plausibility", "maintenance", "gains_reverted", "inputs_not_recorded", "shape_unreadable",
-    "child_ended", "child_silent", "port_failed", "refused", "no_claim", "raw_frames", "lock",
+    "child_ended", "child_silent", "port_failed", "interlock_opened", "refused", "no_claim", "raw_frames", "lock",
 })  # fmt: skip
 
 

@@ -99,6 +99,8 @@ class TelemetryRow:
     optics_innovation: float = math.nan
     barometer_innovation: float = math.nan
     thermometer_innovation: float = math.nan
+    # bit i: interlock i of the configuration is open or its signal lost; NaN without interlocks, or without a reading
+    interlocks_open: float = math.nan
 
     def pack(self) -> bytes:
         """The row as doubles in field order."""
@@ -116,7 +118,9 @@ FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
-FIRST_BYTES = 8 * FIELDS.index("estimate_sigma_um")  # of a row of the first version, which had no estimate
+# Of a row of earlier versions: the first one had no estimate, the second one no interlocks.
+FIRST_BYTES = 8 * FIELDS.index("estimate_sigma_um")
+SECOND_BYTES = 8 * FIELDS.index("interlocks_open")
 
 
 # A mirror counts as settled this long after hold began and after each setpoint ramp: three closed-loop time constants
@@ -172,6 +176,7 @@ class RunStatus:
     acquisition: run_events.AcquisitionState | None = None  # the acquisition's last report
     geometry: run_events.GeometryInForce | None = None  # used by the cycles
     maintenance: Mapping[str, str] = field(default_factory=dict)  # active maintenance notices, by name
+    interlocks: Mapping[str, str] = field(default_factory=dict)  # texts of the open ones, by name
     # failures of the recording, by subject. A full disk may prevent `events.jsonl` from reporting itself
     recording: Mapping[str, str] = field(default_factory=dict)
     loop: Mapping[str, Any] | None = None  # gains set during the run; None: those of the configuration
@@ -186,6 +191,11 @@ class RunStatus:
     def trial_left_s(self) -> float:
         """How long gains on trial may still be kept; NaN if none are."""
         return self.trial_ends_s - self.row.mono_s if self.row else math.nan
+
+    @property
+    def interlock_lines(self) -> tuple[str, ...]:
+        """Each open interlock for people."""
+        return tuple(f"interlock {name} is open: {text}" for name, text in self.interlocks.items())
 
     @property
     def recording_words(self) -> str:
@@ -238,6 +248,10 @@ class RunStatus:
                 return replace(self, maintenance={**self.maintenance, event.name: event.message})
             case events.MaintenanceOver():
                 return replace(self, maintenance=_without(self.maintenance, event.name))
+            case events.InterlockOpened():
+                return replace(self, interlocks={**self.interlocks, event.name: event.text})
+            case events.InterlockClosed():
+                return replace(self, interlocks=_without(self.interlocks, event.name))
             case run_events.GeometryInForce():
                 return replace(self, geometry=event)
             case run_events.AcquisitionState():

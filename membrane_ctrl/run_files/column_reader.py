@@ -120,7 +120,7 @@ def _parts(
     schema = pa.ipc.open_stream(content.data).schema
     known = {TODAY.get(name, name): name for name in schema.names if _is_ours(schema, name)}
     wanted = [name for name in (known if names is None else names) if name in known]
-    absent = sorted(set(names or ()) - set(wanted))
+    absent = sorted(set(names or ()) - set(wanted) - tables.LATER_COLUMNS)
     if absent:
         add_note(notes, f"{path.name}: written by another version, without {', '.join(absent)}")
     if not wanted:

@@ -106,6 +106,7 @@ STREAMS: tuple[Stream, ...] = (
         ),
     ),
     Stream("/estimate/optics_share", (Line("optics_share", "share of the optics", BLUE),)),
+    Stream("/interlocks/open", (Line("interlocks_open", "open interlocks, a bit each", RED),)),
     Stream("/shape/trim", (Line("trim_um", "trim µm", VIOLET, 2.0),)),
     Stream("/gas/pressure", (Line("gauge_pressure_pa", "gauge pressure Pa", BLUE),)),
     Stream("/ambient/pressure", (Line("ambient_pressure_pa", "ambient pressure Pa", ORANGE),)),

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
+from firmware_iface import settings
 from firmware_iface.emulators import pump_board
 from membrane_ctrl.config.schema import Config, DevicesConfig, PumpConfig, TwinConfig
 from membrane_ctrl.model import clock, errors, terminal
@@ -214,11 +215,18 @@ class TwinProcess:
 
         With `lab` it answers as the configured instruments, else as the pump board.
         """
+        if len(config.interlocks) > settings.BOARD_INPUTS and not lab:
+            raise errors.InputError(
+                f"devices.interlocks: {len(config.interlocks)} of them; the twin's pump board has "
+                f"{settings.BOARD_INPUTS} inputs: use --devices, or fewer"
+            )
         truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, plant.TRUTH_BYTES))
         spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = _started(spec, stack)
         watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
-        devices = report.lab or DevicesConfig(board=report.url, **watchdog)
+        devices = report.lab or DevicesConfig(
+            board=report.url, interlocks=_at_board_inputs(config.interlocks), **watchdog
+        )
         return cls(config.model_copy(update={"devices": devices}), truth)
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
@@ -233,6 +241,20 @@ class TwinProcess:
             return truth.displacement_um, truth.laser_bias_um
 
         return newest
+
+
+def _at_board_inputs(interlocks: tuple[settings.InterlockDriver, ...]) -> tuple[settings.InterlockDriver, ...]:
+    """The interlocks with the inputs of the twin's board in place of their sources, in order."""
+    return tuple(
+        settings.BoardInputConfig(
+            driver="board_input",
+            name=interlock.name,
+            text=interlock.text,
+            safe_level=interlock.safe_level,
+            input=index,
+        )
+        for index, interlock in enumerate(interlocks)
+    )
 
 
 # `twin`: the simulated bench on its real protocol, for any client.

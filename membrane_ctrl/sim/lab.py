@@ -12,7 +12,15 @@ from pathlib import Path
 
 from firmware_iface import drivers, settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
-from firmware_iface.emulators import lasers, modbus_server, pressure_gauges, pump_board, pumps, serial_device
+from firmware_iface.emulators import (
+    input_module,
+    lasers,
+    modbus_server,
+    pressure_gauges,
+    pump_board,
+    pumps,
+    serial_device,
+)
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import bench
@@ -48,10 +56,12 @@ class Lab:
         if devices.board is not None:
             self._board = pump_board.PumpBoardEmulator(plant)
             self._tables[devices.board][devices.unit_id] = self._board.state
-        for url, slaves in self._tables.items():
+        self._modules: defaultdict[str, dict[int, input_module.InputModule]] = defaultdict(dict)
+        self._add_modules()
+        for url in self._urls:
             if url.startswith("rtu:"):
                 _, line = modbus_rtu.parse_rtu_url(url)
-                handlers = {unit: partial(respond_to_input, table=found) for unit, found in slaves.items()}
+                handlers = {unit: partial(self._respond, url, unit) for unit in self._units(url)}
                 self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
@@ -60,16 +70,17 @@ class Lab:
         for number, (port, device) in enumerate(self.serial.items()):
             self.wires[port] = serial_device.PtyWire(device, Path(self._folder.name, f"tty{number}"))
             self.wires[port].plug()
-        for url, slaves in self._tables.items():
+        for url in self._urls:
             if url.startswith("tcp:"):
-                self._servers[url] = modbus_server.ModbusTcpServer(partial(_answer, slaves), "127.0.0.1", 0)
+                self._servers[url] = modbus_server.ModbusTcpServer(partial(self._answer, url), "127.0.0.1", 0)
                 await self._servers[url].start()
+        interlocks = tuple(self._moved_interlock(interlock) for interlock in self._devices.interlocks)
+        moved: dict[str, object] = {"interlocks": interlocks}
         if self._board is not None:
             await self._board.start()
-            return self._devices.model_copy(update={"board": self._address(str(self._devices.board))})
-        return self._devices.model_copy(
-            update={role: self._moved(section) for role, section in self._devices.roles().items()}
-        )
+            moved["board"] = self._address(str(self._devices.board))
+        moved |= {role: self._moved(section) for role, section in self._devices.roles().items()}
+        return self._devices.model_copy(update=moved)
 
     async def stop(self) -> None:
         """Unplug everything."""
@@ -87,6 +98,56 @@ class Lab:
         if not isinstance(section, settings.ON_MODBUS):
             return section.model_copy(update={"port": str(self.wires[section.port].path)})
         return section.model_copy(update={"link": self._address(section.link)})
+
+    def _moved_interlock(self, interlock: settings.InterlockDriver) -> settings.InterlockDriver:
+        """The interlock's table with the emulator's address; a GPIO line becomes an input of an emulated module."""
+        match interlock:
+            case settings.ModbusInputConfig():
+                return interlock.model_copy(update={"link": self._address(interlock.link)})
+            case settings.GpioLineConfig():
+                common = interlock.model_dump(include=set(settings.PolledInterlockConfig.model_fields))
+                link = self._address(_gpio_url(interlock.chip))
+                return settings.ModbusInputConfig(driver="modbus_input", link=link, address=interlock.line, **common)
+            case _:
+                return interlock
+
+    @property
+    def _urls(self) -> list[str]:
+        """Links of everything emulated on Modbus."""
+        return list(dict.fromkeys((*self._tables, *self._modules)))
+
+    def _units(self, url: str) -> list[int]:
+        return list(dict.fromkeys((*self._tables.get(url, {}), *self._modules.get(url, {}))))
+
+    def _respond(self, url: str, unit: int, pdu: bytes) -> bytes:
+        """The answer of a unit: its bits from the module, everything else from its registers."""
+        module = self._modules.get(url, {}).get(unit)
+        found = module.respond(pdu) if module is not None else None
+        if found is not None:
+            return found
+        table = self._tables.get(url, {}).get(unit)
+        if table is None:
+            return modbus_server.exception_pdu(pdu, modbus_server.ILLEGAL_FUNCTION)
+        return respond_to_input(pdu, table)
+
+    def _answer(self, url: str, unit: int, pdu: bytes) -> modbus_server.Answer:
+        if unit not in self._units(url):
+            return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
+        return modbus_server.Answer(self._respond(url, unit, pdu))
+
+    def _add_modules(self) -> None:
+        """One module for all interlocks at the same unit, and one for each GPIO chip; every circuit is closed."""
+        bits: defaultdict[tuple[str, int], dict[str, dict[int, Callable[[], bool]]]] = defaultdict(
+            lambda: {"discrete": {}, "coil": {}}
+        )
+        for interlock in self._devices.interlocks:
+            match interlock:
+                case settings.ModbusInputConfig():
+                    bits[interlock.link, interlock.unit_id][interlock.function][interlock.address] = _closed
+                case settings.GpioLineConfig():
+                    bits[_gpio_url(interlock.chip), 1]["discrete"][interlock.line] = _closed
+        for (url, unit), tables in bits.items():
+            self._modules[url][unit] = input_module.InputModule(tables["discrete"], tables["coil"])
 
     def _address(self, url: str) -> str:
         """Address of the emulators of a Modbus URL."""
@@ -184,10 +245,14 @@ class Lab:
         return drive
 
 
-def _answer(slaves: Mapping[int, modbus_server.RegisterTable], unit: int, pdu: bytes) -> modbus_server.Answer:
-    if unit not in slaves:
-        return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
-    return modbus_server.Answer(respond_to_input(pdu, slaves[unit]))
+def _closed() -> bool:
+    """A closed circuit."""
+    return True
+
+
+def _gpio_url(chip: str) -> str:
+    """Link under which the module that stands for a GPIO chip is listed; nothing connects to it."""
+    return f"tcp:{chip}"
 
 
 class MapDevice:

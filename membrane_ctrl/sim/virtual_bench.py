@@ -15,6 +15,7 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators import modbus_server, pump_board
 from firmware_iface.links.modbus_tcp import exception_error
 from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 
 T = TypeVar("T")
 _LASER_NO_LIGHT = 1
@@ -51,15 +52,20 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    `stored` are the settings that the board keeps without power. `wrong` are its switches, `truth` is the true state
-    when the board last took its sample, or would have.
+    `stored` are the settings that the board keeps without power, `interlocks` the configured circuits. `wrong` are
+    its switches, `truth` is the true state when the board last took its sample, or would have.
     """
 
     def __init__(
-        self, plant: Plant, watchdog_s: float = 0.5, stored: pump_board.StoredSettings | None = None
+        self,
+        plant: Plant,
+        watchdog_s: float = 0.5,
+        stored: pump_board.StoredSettings | None = None,
+        interlocks: VirtualInterlocks | None = None,
     ) -> None:
         self.plant = plant
         self.wrong = Wrong()
+        self.interlocks = interlocks or VirtualInterlocks()
         self._sample = self._sampled(None)
         self.board = pump_board.BoardState(
             register_map.default_map(), self._sample, stored or pump_board.StoredSettings()
@@ -69,6 +75,7 @@ class VirtualBench:
     def advance(self, duration_s: float) -> None:
         """Let time pass: the plant moves, the board samples it, judges it and drives it."""
         self.plant.advance(duration_s)
+        self.interlocks.advance(self.plant.time_s)
         self._sample = self._sampled(self._sample)
         self.board.advance(self.plant.time_s, self._sample)
         self.drive()
@@ -94,6 +101,8 @@ class VirtualBench:
     def read(self) -> roles.BenchReading:
         """One sample. Raises LinkError."""
         reading = at_once(self._driver.read())
+        interlocks_open = self.interlocks.open_mask(reading.interlock_inputs, self.plant.time_s)
+        reading = replace(reading, interlocks_open=interlocks_open)
         if math.isnan(self.wrong.readback_fraction):
             return reading
         return replace(reading, pump_fraction=self.wrong.readback_fraction)
@@ -129,7 +138,7 @@ class VirtualBench:
             gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
-            interlock_inputs=sample.interlock_inputs & ~int(wrong.open_interlocks),
+            interlock_inputs=self.interlocks.board_word(sample.interlock_inputs & ~int(wrong.open_interlocks)),
         )
 
 

@@ -45,11 +45,12 @@ def tell(text: str, good: bool | None = None) -> None:
 
 
 def alarms_of(status: Mapping[str, Any]) -> str:
-    """The locks, the fault, the maintenance notices and what the recording lacks, in one line."""
+    """The locks, the fault, the open interlocks, the notices and what the recording lacks, in one line."""
     fault = status.get("fault")
     lines = [f"LOCKED {line}" for line in lock_lines(status)]
     lines += [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
-    lines += [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
+    parts = ("interlocks", "maintenance", "recording")
+    lines += [str(each) for part in parts for each in status.get(part, {}).values()]
     return "; ".join(lines)
 
 

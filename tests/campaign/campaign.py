@@ -21,6 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import campaign_board_stories
+import campaign_interlock_stories
 import campaign_sensor_stories
 import campaign_stories
 from campaign_cases import CASES, SITUATIONS, Case, Situation
@@ -37,7 +38,12 @@ _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real proce
 DOCUMENT = Path(__file__).parents[2] / "docs" / "fault-matrix.md"
 _BY_NAME = {case.name: case for case in CASES}
 _AT = {at.name: at for at in SITUATIONS}
-STORIES = (*campaign_board_stories.STORIES, *campaign_sensor_stories.STORIES, *campaign_stories.STORIES)
+STORIES = (
+    *campaign_board_stories.STORIES,
+    *campaign_interlock_stories.STORIES,
+    *campaign_sensor_stories.STORIES,
+    *campaign_stories.STORIES,
+)
 _STORIES = {story.__name__: story for story in STORIES}
 _HOLDS = {story.__name__: story for story in HOLDS}
 SHORT_SEEDS = (3, 4)  # drawn mirrors; the first may resume, the second may not
@@ -108,6 +114,7 @@ def run_short(first: str = "") -> Iterator[tuple[str, tuple[str, ...]]]:
     parts = {
         "holds": _tell_short(_HOLDS),
         "board": _tell_short([story.__name__ for story in campaign_board_stories.STORIES]),
+        "interlocks": _tell_short([story.__name__ for story in campaign_interlock_stories.STORIES]),
         "orders": _tell_short([story.__name__ for story in campaign_stories.STORIES]),
         "matrix": _run_short_matrix(),
         "sensors": _tell_short([story.__name__ for story in campaign_sensor_stories.STORIES]),

@@ -120,6 +120,32 @@ def test_answers_that_contradict_each_other_write_nothing(
     assert not path.exists()
 
 
+def test_a_pump_and_a_gauge_on_one_register_write_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    laser = ["optoncdt1420", "/dev/x"]
+    pump = ["modbus_map", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
+    gauge = ["modbus_map", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
+    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "") == 2
+    told = capsys.readouterr().err
+    assert "devices.pump.address and devices.gauge_pressure.address name the same holding register 7" in told
+    assert not path.exists()
+
+
+def test_two_names_of_one_serial_port_write_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    port, other = tmp_path / "ttyUSB0", tmp_path / "by-id"
+    port.touch()
+    other.symlink_to(port)
+    answers = ["", "optoncdt1420", str(port), "ventus", str(other), "mks_937b", "/dev/y", "", "", "", ""]
+    assert answered(monkeypatch, path, *answers) == 2
+    assert "devices.displacement and devices.pump name the same port" in capsys.readouterr().err
+    assert not path.exists()
+
+
 def test_an_end_of_the_answers_writes_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     assert answered(monkeypatch, path) == 130

@@ -55,6 +55,30 @@ def test_a_safe_level_names_its_fault() -> None:
     assert line(safe_level=SafeLevel.PUMP_OFF) == "pump is off: unknown fault"
 
 
+VALUE = {"driver": "modbus_map", "link": "tcp://plc", "raw": [0, 1], "value": [0.0, 1.0]}
+NO_VENT = Config.model_validate(
+    {"devices": {r: VALUE | {"address": n} for n, r in enumerate(("displacement", "pump", "gauge_pressure"))}}
+)
+WITH_VENT = Config.model_validate(
+    {"devices": {**NO_VENT.devices.model_dump(exclude_none=True), "vent": VALUE | {"address": 9}}}  # type: ignore[union-attr]
+)
+
+
+def test_a_bench_without_a_vent_is_never_said_to_have_it_open() -> None:
+    row = replace(HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan)
+    said = why(row, "", "over pressure", NO_VENT)
+    assert said == "pump is off; no vent is fitted, the leak lowers the mirror: over pressure"
+    assert why(row, "", "over pressure", WITH_VENT) == "pump is off and the vent is open: over pressure"
+
+
+@pytest.mark.parametrize(("readback", "open_"), [(1.0, True), (0.5, True), (0.49, False), (0.0, False)])
+def test_a_vent_whose_read_back_contradicts_its_command_is_not_said_to_be_open(readback: float, open_: bool) -> None:
+    said = line(safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=readback, fault="x")
+    assert said.startswith("pump is off and the vent is open") == open_
+    if not open_:
+        assert f"commanded open, but its read-back is {100 * readback:.0f}" in said
+
+
 def test_without_a_reading_the_pump_keeps_its_flow() -> None:
     said = "pump keeps its last mean flow: no valid laser reading"
     assert line(displacement_um=math.nan) == said

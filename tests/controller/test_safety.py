@@ -55,6 +55,7 @@ BAD = {
     "pump_runs_on": replace(GOOD, runs_on="read-back 100 %"),
     "gas_comes_in": replace(GOOD, inflow="+40 um in 20 s"),
     "board_taken": replace(GOOD, foreign=FOREIGN_PERIOD),
+    "interlock_open": replace(GOOD, open_interlocks=1, interlock_level=SafeLevel.PUMP_OFF, interlock_words="door"),
     "locked": replace(GOOD, locked="hands inside"),
     "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
 }
@@ -191,3 +192,25 @@ def test_the_mirror_may_be_far_from_its_setpoint_on_neither_side(side: float) ->
     table = SafetyTable(LIMITS)
     far = replace(GOOD, error_um=side * (LIMITS.following_error_max_um + 0.1))
     assert any(table.judge(State.HOLD, far).rule is not None for _ in range(100))
+
+
+@pytest.mark.parametrize("level", [SafeLevel.RAMP_DOWN, SafeLevel.PUMP_OFF, SafeLevel.VENT])
+@pytest.mark.parametrize("state", [state for state in State if state != State.STANDBY])
+def test_an_open_interlock_enters_its_own_level_in_one_tick(state: State, level: SafeLevel) -> None:
+    verdict = SafetyTable(LIMITS).judge(state, replace(BAD["interlock_open"], interlock_level=level))
+    assert verdict.rule is not None
+    assert (verdict.rule.name, verdict.safe_level, verdict.seen) == ("interlock_open", level, "door")
+    assert verdict.rule.fault(verdict.seen, verdict.safe_level).safe_level == level.name.lower()
+
+
+def test_an_open_interlock_whose_level_is_not_known_stops_the_pump_at_least_slowly() -> None:
+    verdict = SafetyTable(LIMITS).judge(State.HOLD, replace(BAD["interlock_open"], interlock_level=SafeLevel.NONE))
+    assert verdict.safe_level == SafeLevel.RAMP_DOWN
+
+
+@pytest.mark.parametrize(("level", "name"), [(SafeLevel.RAMP_DOWN, "link_lost"), (SafeLevel.VENT, "interlock_open")])
+def test_of_rules_that_trip_together_the_level_of_this_observation_decides(level: SafeLevel, name: str) -> None:
+    both = replace(BAD["link_lost"], open_interlocks=1, interlock_level=level)
+    rule = SafetyTable(LIMITS).judge(State.HOLD, both).rule
+    assert rule is not None
+    assert rule.name == name

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig, LoopConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import TABLE, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety import MOVING
@@ -18,7 +18,12 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 DT_S = 0.1
+INTERLOCKS = tuple(
+    {"driver": "board_input", "name": level, "text": "x", "safe_level": level, "input": place}
+    for place, level in enumerate(("ramp_down", "pump_off", "vent"))
+)
 CONFIG = Config(
+    devices=DevicesConfig.model_validate({"board": "tcp://twin", "interlocks": INTERLOCKS}),
     loop=LoopConfig(rate_hz=1 / DT_S),
     shape=ShapeConfig(enabled=False),
     states=StatesConfig(check_s=0.3, actuator_test=False, settle_s=0.3, hold_flow_max_s=1.0, ramp_down_s=1.0),
@@ -40,6 +45,7 @@ readings = st.builds(
     device_time_s=st.just(0.0),
     watchdog_tripped=st.sampled_from([False] * 9 + [True]),
     latched_faults=st.sampled_from([0] * 9 + [1]),
+    interlocks_open=st.sampled_from([0] * 9 + [1, 2, 4]),
 )
 steady = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, math.inf, 0.0, 1, 0.0, False, 0)
 commands = st.builds(
@@ -92,13 +98,15 @@ class Driver:
                 0.1 * self.counter,
                 reading.watchdog_tripped,
                 reading.latched_faults,
+                interlocks_open=reading.interlocks_open,
             )
         inputs = TickInputs(
             now_s=self.tick * DT_S, dt_s=DT_S, reading=reading if link_up else None, link_up=link_up, commands=asked
         )
-        self.look(self.controller.tick(inputs), len(asked))
+        interlock_open = inputs.reading is not None and inputs.reading.interlocks_open != 0
+        self.look(self.controller.tick(inputs), len(asked), interlock_open)
 
-    def look(self, outputs: TickOutputs, asked: int) -> None:
+    def look(self, outputs: TickOutputs, asked: int, interlock_open: bool) -> None:
         row, command = outputs.row, outputs.command
         state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
         assert 0.0 <= command.pump_fraction <= 1.0
@@ -114,6 +122,7 @@ class Driver:
             self.fault_pump = command.pump_fraction
         else:
             self.fault_pump = math.inf
+        assert not interlock_open or state in (State.STANDBY, State.LOWER, State.FAULT)
         assert len(outputs.answers) == asked
         for event in outputs.events:
             json.dumps(event.to_dict(), allow_nan=False, default=str)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
 
 from firmware_iface.emulators.pump_board import BoardSample
-from firmware_iface.register_map import default_map
+from firmware_iface.register_map import default_map, known_maps
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig
 from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latched
 from membrane_ctrl.instruments.bench import connect, open_bench
-from membrane_ctrl.model.errors import DeviceError
+from membrane_ctrl.model.errors import DeviceError, FindingsError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
 from tests.support.faulty_board import PumpBoardEmulator
 
@@ -135,3 +136,34 @@ def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(tmp_path: Pa
         _latched(Config(), tmp_path, options())
     assert _latched(Config(), tmp_path, options(standby=True)) is not None
     assert (tmp_path / NAME).read_text() == content
+
+
+DOOR = {"driver": "board_input", "name": "door", "text": "shut the door", "input": 3}
+
+
+class Door(Still):
+    """The mirror with an open door at input 3."""
+
+    def sample(self) -> BoardSample:
+        return replace(super().sample(), interlock_inputs=0xFFFF & ~(1 << 3))
+
+
+async def test_an_open_interlock_is_refused_and_in_standby_waited_for() -> None:
+    emulator = PumpBoardEmulator(Door())
+    await emulator.start()
+    devices = DevicesConfig.model_validate({"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]})
+    with pytest.raises(DeviceError, match=r"interlock door is open: shut the door; close it.*--standby"):
+        await _identify(open_bench(devices), Config(devices=devices), options())
+    assert await _identify(open_bench(devices), Config(devices=devices), options(standby=True)) == BoardAtStart()
+    other = DevicesConfig.model_validate({**devices.model_dump(), "interlocks": [DOOR | {"input": 2}]})
+    assert await _identify(open_bench(other), Config(devices=other), options()) == BoardAtStart()
+    await emulator.stop()
+
+
+async def test_an_input_of_a_board_of_an_earlier_map_is_refused() -> None:
+    emulator = PumpBoardEmulator(Still(), registers=known_maps()[2])
+    await emulator.start()
+    devices = DevicesConfig.model_validate({"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]})
+    with pytest.raises(FindingsError, match="register map 2"):
+        await _identify(open_bench(devices), Config(devices=devices), options(standby=True))
+    await emulator.stop()

@@ -9,7 +9,17 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
 from membrane_ctrl.controller.redundancy import FilmSensor
-from membrane_ctrl.controller.safety import ALWAYS, CONNECTED, HOLDING, MOVING, NOT_YET_FAULT, STANDING, TABLE, Rule
+from membrane_ctrl.controller.safety import (
+    ALWAYS,
+    CONNECTED,
+    GAS_MOVES,
+    HOLDING,
+    MOVING,
+    NOT_YET_FAULT,
+    STANDING,
+    TABLE,
+    Rule,
+)
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 _DOCS = Path(__file__).parents[2] / "docs"
@@ -22,6 +32,7 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("every state", ALWAYS),
     ("all but fault", NOT_YET_FAULT),
     ("check, inflate, settle, hold, manual, tune", CONNECTED),
+    ("check, inflate, settle, hold, manual, tune, lower, fault", GAS_MOVES | {State.FAULT}),
     ("inflate, settle, hold, manual, tune", MOVING),
     ("hold", HOLDING),
     ("settle, hold", STANDING),
@@ -31,7 +42,7 @@ _LEVELS = {
     SafeLevel.HOLD_FLOW: "the pump keeps its last mean flow, until the cause is gone",
     SafeLevel.RAMP_DOWN: "the flow ramps down to zero",
     SafeLevel.PUMP_OFF: "the pump is off, the leak lowers the mirror",
-    SafeLevel.VENT: "the pump is off, the vent is open",
+    SafeLevel.VENT: "the pump is off, the vent is open; without a vent the leak lowers the mirror",
 }
 
 
@@ -49,9 +60,9 @@ def faults_page() -> str:
         "first cause of a fault is the one reported. Every level below `hold_flow` latches: the state is `fault`",
         "until a person acknowledges it, or until the cause has been absent for `resume.wait_s`, provided that",
         "the rule's name is in `resume.faults` and the day's `resume.most_per_day` is not used up. A fault that",
-        "vented the mirror, a board fault other than its watchdog's trip, and a person's lock never resume",
-        "automatically; one of them seen during a fault decides for the whole fault. `resume.faults` accepts only",
-        "the names of faults that may resume.",
+        "vented the mirror, a board fault other than its watchdog's trip, an open interlock, and a person's lock",
+        "never resume automatically; one of them seen during a fault decides for the whole fault. `resume.faults`",
+        "accepts only the names of faults that may resume.",
         "",
         "## Safe levels",
         "",
@@ -136,7 +147,7 @@ def _row(rule: Rule) -> str:
         rule.cause,
         f"{rule.needed} / {rule.window}",
         _limit(rule.limit),
-        rule.safe_level.name.lower(),
+        rule.enters or rule.safe_level.name.lower(),
         "yes" if rule.latching else "when it times out",
         "yes" if rule.may_resume else "-",
         where,

@@ -1,0 +1,85 @@
+"""A stand-in for the package `gpiod`: GPIO chips with contacts that a test opens, closes or cuts."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+
+class EmulatedGpio:
+    """A stand-in for the package `gpiod`: chips with lines whose electrical levels a test sets.
+
+    Attributes
+    ----------
+    contacts : dict of (str, int) to str
+        By chip and line: "closed", "open" or "cut" (a broken wire).
+    failing : OSError or None
+        Raised by every call while set.
+    """
+
+    class line:  # noqa: N801 - the package's own name
+        """Enumerations of the package."""
+
+        class Direction:
+            INPUT = "input"
+
+        class Bias:
+            PULL_UP = "pull-up"
+            PULL_DOWN = "pull-down"
+            DISABLED = "disabled"
+
+        class Value:
+            ACTIVE = "active"
+            INACTIVE = "inactive"
+
+    class LineSettings:
+        """Settings of a line, as the package takes them."""
+
+        def __init__(self, direction: str, bias: str, active_low: bool) -> None:
+            self.direction, self.bias, self.active_low = direction, bias, active_low
+
+    def __init__(self, contacts: dict[tuple[str, int], Literal["closed", "open", "cut"]]) -> None:
+        self.contacts = contacts
+        self.failing: OSError | None = None
+        self.requests = 0
+
+    def request_lines(self, chip: str, consumer: str, config: Mapping[int, LineSettings]) -> "EmulatedRequest":
+        """Request lines. Raises OSError, and ValueError for lines that the chip does not have."""
+        self.check()
+        if missing := [line for line in config if (chip, line) not in self.contacts]:
+            raise ValueError(f"line {missing[0]} does not exist")
+        self.requests += 1
+        return EmulatedRequest(self, chip, dict(config))
+
+    def check(self) -> None:
+        """Raise the present failure, if any."""
+        if self.failing is not None:
+            raise self.failing
+
+
+class EmulatedRequest:
+    """Requested lines."""
+
+    def __init__(self, gpio: EmulatedGpio, chip: str, config: Mapping[int, EmulatedGpio.LineSettings]) -> None:
+        self._gpio, self._chip, self._config = gpio, chip, config
+        self.released = False
+
+    def get_values(self, lines: list[int]) -> list[str]:
+        """Values of lines in their order."""
+        self._gpio.check()
+        return [self._value(line) for line in lines]
+
+    def release(self) -> None:
+        """Give the lines back."""
+        self.released = True
+
+    def _value(self, line: int) -> str:
+        settings = self._config[line]
+        raised = self._is_raised(line, settings)
+        active = not raised if settings.active_low else raised
+        return EmulatedGpio.line.Value.ACTIVE if active else EmulatedGpio.line.Value.INACTIVE
+
+    def _is_raised(self, line: int, settings: EmulatedGpio.LineSettings) -> bool:
+        """The electrical level: the contact's if it is closed, otherwise that of the pull resistor."""
+        to_ground = settings.active_low
+        if self._gpio.contacts[self._chip, line] == "closed":
+            return not to_ground
+        return to_ground if settings.bias == "disabled" else settings.bias == EmulatedGpio.line.Bias.PULL_UP

@@ -1,0 +1,86 @@
+"""Which interlocks are open in a tick, and which safe level that demands. No I/O, no clock.
+
+A tick without an answer of the bench shows no interlock: the rules `link_lost` and `device_silent` judge that. A lost
+signal of a single interlock is a set bit of the reading, as an open circuit is.
+
+In standby the pump is off and an open interlock is no fault: people work at the mirror then. It prevents a hold. On
+the way down from standby it stays none, so that a program can be ended while a door is open.
+"""
+
+from collections.abc import Iterator
+
+from firmware_iface.roles import BenchReading
+from firmware_iface.settings import InterlockConfig
+from membrane_ctrl.model.events import Event, InterlockClosed, InterlockOpened
+from membrane_ctrl.model.telemetry import SafeLevel, State
+
+
+class Interlocks:
+    """The interlocks of a configuration; bit i of each mask is the i-th of them.
+
+    Attributes
+    ----------
+    open_mask : int
+        Those that are open in this tick's reading; 0 in a tick without one.
+    judged_mask : int
+        Of these, the ones that are a fault in a state that judges interlocks.
+    last_mask : int
+        Those that were open in the last reading, which may be of an earlier tick.
+    seen : bool
+        This tick has a reading.
+    """
+
+    def __init__(self, configured: tuple[InterlockConfig, ...]) -> None:
+        self._names: tuple[str, ...] = tuple(interlock.name for interlock in configured)
+        self._texts: tuple[str, ...] = tuple(interlock.text for interlock in configured)
+        levels = (SafeLevel[interlock.safe_level.upper()] for interlock in configured)
+        self._levels: tuple[SafeLevel, ...] = tuple(levels)
+        self._standby_mask = 0  # open without a break since standby
+        self.open_mask = 0
+        self.judged_mask = 0
+        self.last_mask = 0
+        self.seen = False
+
+    def look(self, reading: BenchReading | None, state: State) -> list[Event]:
+        """Take the reading of a tick in a state; returns the events of circuits that have opened or closed."""
+        self.seen = reading is not None
+        if reading is None:
+            self.open_mask = 0
+            self.judged_mask = 0
+            return []
+        self.open_mask = reading.interlocks_open & ((1 << len(self._names)) - 1)
+        changed = self.open_mask ^ self.last_mask
+        self.last_mask = self.open_mask
+        if state == State.STANDBY:
+            self._standby_mask = self.open_mask
+        self._standby_mask &= self.open_mask
+        self.judged_mask = self.open_mask
+        if state == State.LOWER:
+            self.judged_mask &= ~self._standby_mask
+        return [self._event(place) for place in _places(changed)]
+
+    def _event(self, place: int) -> Event:
+        if not self.open_mask >> place & 1:
+            return InterlockClosed(self._names[place])
+        return InterlockOpened(self._names[place], self._texts[place], self._levels[place].name.lower())
+
+    @property
+    def any_configured(self) -> bool:
+        """Whether there are interlocks."""
+        return bool(self._names)
+
+    @property
+    def safe_level(self) -> SafeLevel:
+        """The deepest level that the judged interlocks demand."""
+        return max((self._levels[place] for place in _places(self.judged_mask)), default=SafeLevel.NONE)
+
+    def describe_open(self, mask: int) -> str:
+        """Names and texts of the interlocks of a mask, for people; empty for none."""
+        return "; ".join(f"interlock {self._names[place]} is open: {self._texts[place]}" for place in _places(mask))
+
+
+def _places(mask: int) -> Iterator[int]:
+    """Yield the places of the set bits, lowest first."""
+    for place in range(mask.bit_length()):
+        if mask >> place & 1:
+            yield place
