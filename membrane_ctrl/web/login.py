@@ -29,6 +29,7 @@ from membrane_ctrl.web.connections import ConnectionGuard
 from membrane_ctrl.web.public_address import PublicAddress, host_name
 from membrane_ctrl.web.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
 
+LOGIN_PATH = "/login"
 STOP_PATH = "/stop"
 _FORM_BYTES_MAX = 4096
 _FORM_S = 5.0
@@ -110,11 +111,12 @@ class LoginMiddleware:
         user = self._accounts.user(cookies.get(COOKIE, ""))
         if user is not None:
             self._guard.mark_known(scope.get("client"))
+        if scope.get("method") == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH:
+            await self._log_in(scope, receive, send, cookies.get(DEVICE_COOKIE, ""))
+        elif user is not None:
             await self._serve(self._inside(scope, user), receive, send)
         elif scope["type"] == "websocket":
             await self._refuse(scope, send, Refusal(HTTPStatus.UNAUTHORIZED, "log in first"))
-        elif scope["method"] == "POST" and self._address.path_inside(scope["path"]) == "/login":
-            await self._log_in(scope, receive, send, cookies.get(DEVICE_COOKIE, ""))
         else:
             await self._open_link(scope, send)
 
@@ -212,7 +214,8 @@ class LoginMiddleware:
         headers = [_text_type("html")]
         if retry_s is not None:
             headers.append((b"retry-after", str(math.ceil(retry_s)).encode()))
-        if _has_body(scope) and scope["path"] != "/login":
+        read = scope["method"] == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH
+        if _has_body(scope) and not read:
             headers.append(_CLOSE)  # the body of a request that is not read would still be received
         await _answer(scope, send, status, page, headers)
 

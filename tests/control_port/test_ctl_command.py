@@ -70,7 +70,7 @@ def test_options_stand_anywhere(words: list[str], asked: Asked) -> None:
         ("explode", None, "No such command 'explode'"),
         ("tune", None, "No such command 'tune'"),
         ("setpoint", None, "Missing argument 'UM'"),
-        ("setpoint", "high", "valid number"),
+        ("setpoint", "high", "not a plain decimal number"),
         ("setpoint", "nan", "not a plain decimal number"),
         ("setpoint", "1_0", "not a plain decimal number"),
         ("setpoint", "1,000", "has a comma"),
