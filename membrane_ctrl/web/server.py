@@ -4,9 +4,7 @@ import asyncio
 import os
 import ssl
 import sys
-from collections.abc import Mapping
 from functools import partial
-from http import HTTPStatus
 from pathlib import Path
 
 from fastapi import Request
@@ -18,15 +16,16 @@ from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.web.access import STOP, Accounts, WebUser, known_users, may, request
+from membrane_ctrl.web.access import Accounts, WebUser, known_users
 from membrane_ctrl.web.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, HoldFeed
 from membrane_ctrl.web.figures import REMOVED
-from membrane_ctrl.web.login import LoginMiddleware, StopHandler
+from membrane_ctrl.web.login import LoginMiddleware
 from membrane_ctrl.web.page import SharedViews, WebPage
 from membrane_ctrl.web.panels import REPORT, run_folder
 from membrane_ctrl.web.public_address import public_address
-from membrane_ctrl.web.work_pools import REPORT_FILES, SAFETY_COMMANDS, PoolFullError
+from membrane_ctrl.web.stop_route import stop_handler
+from membrane_ctrl.web.work_pools import REPORT_FILES, PoolFullError
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 _AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
@@ -75,8 +74,8 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     views = SharedViews(feeds)
 
     @ui.page("/", title="membrane_ctrl")
-    def view(asked: Request, hold: str = "") -> None:
-        user: WebUser = asked.scope["membrane_user"]
+    def view(request: Request, hold: str = "") -> None:
+        user: WebUser = request.scope["membrane_user"]
         WebPage(feeds, hold if hold in feeds else next(iter(feeds)), user, views).build()
 
     @app.get("/chart")
@@ -124,24 +123,6 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         loop="membrane_ctrl.web.connections:PageLoop" if page.secure else "auto",
         proxy_headers=False,  # `PublicAddress.source_of` reads them, if the proxy is a trusted one
     )
-
-
-def stop_handler(feeds: Mapping[str, HoldFeed]) -> StopHandler:
-    """Return what answers `POST /stop?hold=NAME`: on threads and a connection to the hold that serve nothing else."""
-
-    async def stop(user: WebUser, hold: str) -> tuple[HTTPStatus, str]:
-        feed = feeds.get(hold)
-        if feed is None:
-            return HTTPStatus.NOT_FOUND, f"stop: no hold {hold!r}; known: {', '.join(feeds)}"
-        if not may(user, feed.seen.role, STOP):
-            return HTTPStatus.FORBIDDEN, f"stop: needs the role {STOP.role}, of the viewer and of the page"
-        try:
-            outcome = await SAFETY_COMMANDS.run(feed.ask, request(STOP, f"web: {user.name}", "", take_over=True))
-        except PoolFullError as error:
-            return HTTPStatus.SERVICE_UNAVAILABLE, f"stop: not sent: {error}"
-        return (HTTPStatus.OK if outcome.endswith(": done") else HTTPStatus.CONFLICT), outcome
-
-    return stop
 
 
 class HangUp:
