@@ -64,9 +64,15 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     raise_file_limit()
     address = public_address(page)
     feeds = {name: HoldFeed(where) for name, where in holds.items()}
-    app.add_middleware(HangUp)  # inside the login: the last added comes first
     guard = ConnectionGuard()
-    app.add_middleware(LoginMiddleware, accounts=accounts, address=address, stop=stop_handler(feeds), guard=guard)
+    build_inside = app.build_middleware_stack
+
+    def build_middleware_stack() -> ASGIApp:
+        """Put the login outside of everything: NiceGUI adds middlewares later than we could with `add_middleware`."""
+        inside = HangUp(build_inside())
+        return LoginMiddleware(inside, accounts, address, stop_handler(feeds), guard)
+
+    app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
     for feed in feeds.values():
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)

@@ -339,7 +339,8 @@ async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
         fields = ("FLNK mir", "OUT mir", "SCAN [6]", "PROC [1]")
         assert await said_by(HOSTILE_CA, ports) == {
             **{f"setpoint.{each}": "ECA_NOWTACCESS" for each in fields},
-            "stop.ASG DEF": "ECA_NOWTACCESS", "stop.DISP [1]": "ECA_NOWTACCESS", "setpoint nan": NOT_A_NUMBER.format("nan"),
+            "stop.ASG DEF": "ECA_NOWTACCESS", "stop.DISP [1]": "ECA_NOWTACCESS",
+            "setpoint nan": NOT_A_NUMBER.format("nan"),
             "setpoint 100": "setpoint refused: setpoint 1e+09 um is outside the limits (-2000 .. 500 um)",
             "mark xxx": "mark refused: longer than 500 bytes",
             "mark b'\\": "mark refused: text: only printable characters, in one line",

@@ -209,11 +209,12 @@ async def attack(name: str, url: str, clients: int) -> AsyncIterator[None]:
 
 
 class Viewer:
-    """A client of the service with a session."""
+    """A client of the service, which may log in; `address` is its own network address."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, address: str | None = None) -> None:
         self.url = url
-        self.client = httpx.AsyncClient(base_url=url, timeout=60.0)
+        transport = httpx.AsyncHTTPTransport(local_address=address)
+        self.client = httpx.AsyncClient(base_url=url, timeout=60.0, transport=transport)
 
     async def log_in(self, name: str, password: str) -> int:
         """Log in; returns the status of the answer."""
