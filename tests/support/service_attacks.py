@@ -39,7 +39,8 @@ class Routes:
 ROUTES = Routes()
 
 
-async def _connect(url: str) -> Streams:
+async def connect(url: str) -> Streams:
+    """Open a connection to a service."""
     parts = urlsplit(url)
     return await asyncio.open_connection(parts.hostname, parts.port)
 
@@ -69,7 +70,7 @@ async def status_of(url: str, raw: bytes, wait_s: float = 20.0) -> int:
     int
         The status of the answer, 0 if the connection was closed without one.
     """
-    reader, writer = await _connect(url)
+    reader, writer = await connect(url)
     try:
         async with asyncio.timeout(wait_s):
             with contextlib.suppress(OSError):
@@ -88,7 +89,7 @@ async def _flood_logins(url: str, number: int) -> None:
     """Post wrong passwords for a name of its own without a pause, on one connection as long as it lives."""
     form = f"name=x{number}&password=yyyyyyyy".encode()
     raw = request_bytes(url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded")
-    reader, writer = await _connect(url)
+    reader, writer = await connect(url)
     with contextlib.closing(writer):
         while True:
             writer.write(raw)
@@ -100,7 +101,7 @@ async def _flood_owner(url: str, number: int) -> None:
     """Post wrong passwords for the owner's name without a pause."""
     form = f"name=anna&password=guess{number:04}".encode()
     raw = request_bytes(url, ROUTES.login, "POST", form)
-    reader, writer = await _connect(url)
+    reader, writer = await connect(url)
     with contextlib.closing(writer):
         while True:
             writer.write(raw)
@@ -112,7 +113,7 @@ async def _open_sockets(url: str, number: int) -> None:
     """Ask for a web socket without a session, again and again."""
     key = base64.b64encode(os.urandom(16)).decode()
     upgrade = ("Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13")
-    reader, writer = await _connect(url)
+    reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, ROUTES.socket, "GET", b"", *upgrade))
         await reader.read()
@@ -120,14 +121,14 @@ async def _open_sockets(url: str, number: int) -> None:
 
 async def _stay_silent(url: str, number: int) -> None:
     """Open a connection and send nothing."""
-    reader, writer = await _connect(url)
+    reader, writer = await connect(url)
     with contextlib.closing(writer):
         await reader.read()
 
 
 async def _drip_head(url: str, number: int) -> None:
     """Send a head that never ends, a byte a second."""
-    _reader, writer = await _connect(url)
+    _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, "")[:-2] + b"X-Padding: ")
         while True:
@@ -138,7 +139,7 @@ async def _drip_head(url: str, number: int) -> None:
 
 async def _drip_body(url: str, number: int) -> None:
     """Announce a form and send it a byte a second."""
-    _reader, writer = await _connect(url)
+    _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, ROUTES.login, "POST", b"n" * 3000)[:-3000])
         while True:
@@ -149,7 +150,7 @@ async def _drip_body(url: str, number: int) -> None:
 
 async def _send_large_heads(url: str, number: int) -> None:
     """Send headers without end, as fast as they are received."""
-    _reader, writer = await _connect(url)
+    _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, "")[:-2])
         while True:
@@ -161,7 +162,7 @@ async def _send_large_bodies(url: str, number: int) -> None:
     """Post a body of a gigabyte, as fast as it is received."""
     path = ROUTES.login if number % 2 else ""
     head = request_bytes(url, path, "POST").replace(b"Content-Length: 0", b"Content-Length: 1000000000")
-    _reader, writer = await _connect(url)
+    _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(head)
         while True:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.control_port.port_run import PortRun
+from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import browser_tab
 from tests.support.reverse_proxy import NGINX, reverse_proxy
 from tests.support.service_attacks import ROUTES, Viewer, attack, request_bytes, status_of
-from tests.web.test_page import free_port, needs_browser, served, ticking
+from tests.web.test_page import STOP, free_port, needs_browser, served, ticking
 from tests.web.test_page_under_attack import PASSWORD, serving
 
 pytestmark = [
@@ -144,8 +144,6 @@ async def test_a_flood_through_the_proxy_delays_no_viewer(tmp_path: Path) -> Non
 async def test_a_browser_operates_the_hold_under_a_path(tmp_path: Path) -> None:
     outside, inside = free_port(), free_port()
     public = f"http://127.0.0.1:{outside}/mirror/"
-    from tests.control_port.port_run import port_run
-
     async with (
         port_run(tmp_path) as run,
         served(tmp_path, "--port", str(inside), "--public-url", public) as link,
@@ -159,7 +157,7 @@ async def test_a_browser_operates_the_hold_under_a_path(tmp_path: Path) -> None:
                 await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
                 fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/mirror/chart?'))"
                 await tab.until(f"{fetched}.some(r => r.responseStatus === 200 && r.decodedBodySize > 500)")
-                await tab.click("STOP")
+                await tab.value(f"{STOP}.click()")
                 await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
                 await tab.click("Do it")
                 await tab.until("document.body.innerText.includes('stop: done')")
