@@ -15,7 +15,8 @@ from tests.support.service_attacks import ATTACKS, ROUTES, Viewer, attack
 from tests.web.test_page import served, ticking
 
 PASSWORD = "correct horse"
-LONGEST_S = 1.0
+STOP_S = 1.0
+CHART_S = 3.0  # also on a busy machine
 
 
 @asynccontextmanager
@@ -44,8 +45,8 @@ async def test_strangers_delay_neither_chart_nor_stop(name: str, tmp_path: Path)
             async with Viewer(url) as other:  # on a new connection
                 other.client.cookies = anna.client.cookies
                 stops_s += await other.latencies_s(ROUTES.stop, 1, method="POST")
-        assert max(charts_s) < LONGEST_S, charts_s
-        assert max(stops_s) < LONGEST_S, stops_s
+        assert max(charts_s) < CHART_S, charts_s
+        assert max(stops_s) < STOP_S, stops_s
         assert [command.kind for command in run.asked] == ["stop"] * 9
 
 
@@ -71,7 +72,7 @@ async def test_a_user_who_asks_for_everything_delays_no_other(tmp_path: Path) ->
         stops_s = await anna.latencies_s(ROUTES.stop, 10, method="POST")
         assert not greedy.done(), greedy
         greedy.cancel()
-        assert max(stops_s) < LONGEST_S, stops_s
+        assert max(stops_s) < STOP_S, stops_s
 
 
 @pytest.mark.real_time
