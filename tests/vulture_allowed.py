@@ -24,3 +24,5 @@ _.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
 _.screen_x_mm, _.screen_y_mm, _.screen_turn_x_deg, _.screen_turn_y_deg, _.screen_turn_z_deg  # sigmas, read by name
 _.camera_yaw_deg, _.camera_pitch_deg, _.camera_roll_deg, _.focal_relative, _.k1, _.k2, _.p1, _.p2, _.pitch_relative
 pump_map  # of an event of runs of earlier versions
+_.by_password  # a login in one call, for tests and programs
+PageLoop  # named as text to uvicorn

@@ -260,7 +260,7 @@ class WebPage:
             given = None
             if action.asks:  # a hidden one would take the focus, and Enter with it
                 given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").classes("w-full")
-                given.props(f'autofocus inputmode="{"decimal" if action.asks == "number" else "text"}"')
+                given.props('autofocus inputmode="text"')  # a phone's decimal keys may lack the minus or the point
                 given.on("keydown.enter", lambda: dialog.submit("yes"))
             take_over = ui.checkbox("take command from whoever has it")
             with ui.row():

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from membrane_ctrl.model.numbers import TEXT_LENGTH_MAX, parse_number, parse_whole_number
+from membrane_ctrl.model.numbers import TEXT_LENGTH_MAX, parse_number
 
 NOT_NUMBERS = (
     "", " ", "+", "-", ".", "e5", "1e", "1e+", "--1", "+-1", "1.2.3",
@@ -20,12 +20,11 @@ NOT_NUMBERS = (
 
 @pytest.mark.parametrize("text", NOT_NUMBERS, ids=lambda text: ascii(text[:20]))
 def test_a_text_that_is_not_plain_decimal_notation_is_refused(text: str) -> None:
-    for parse in (parse_number, parse_whole_number):
-        with pytest.raises(ValueError, match=r"number|comma|large") as refusal:
-            parse(text)
-        reason = str(refusal.value)
-        assert len(reason) < 200
-        assert reason.isprintable()
+    with pytest.raises(ValueError, match=r"number|comma|large") as refusal:
+        parse_number(text)
+    reason = str(refusal.value)
+    assert len(reason) < 200
+    assert reason.isprintable()
 
 
 @pytest.mark.parametrize(
@@ -44,14 +43,3 @@ def test_each_double_that_python_prints_is_read_back_exactly() -> None:
     for _ in range(2000):
         value = rng.uniform(-1.0, 1.0) * 10.0 ** rng.randint(-300, 300)
         assert parse_number(repr(value)) == value
-
-
-@pytest.mark.parametrize(("text", "value"), [("12", 12), ("-3", -3), ("+4", 4), ("007", 7)])
-def test_plain_whole_numbers_are_read(text: str, value: int) -> None:
-    assert parse_whole_number(text) == value
-
-
-@pytest.mark.parametrize("text", ["1.0", "1e3", ".5"])
-def test_a_fraction_is_not_a_whole_number(text: str) -> None:
-    with pytest.raises(ValueError, match="whole number"):
-        parse_whole_number(text)
