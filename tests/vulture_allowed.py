@@ -26,3 +26,5 @@ _.camera_yaw_deg, _.camera_pitch_deg, _.camera_roll_deg, _.focal_relative, _.k1,
 pump_map  # of an event of runs of earlier versions
 _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose request has these
 _.enters  # a rule's level for people, in the generated page
+_.by_password  # a login in one call, for tests and programs
+PageLoop  # named as text to uvicorn

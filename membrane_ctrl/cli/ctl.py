@@ -1,7 +1,6 @@
 """The commands of `ctl`: one for each command of a running hold, with its own arguments and the common options."""
 
 import inspect
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +10,7 @@ from typer.core import TyperGroup
 
 from membrane_ctrl.cli.options import JsonOption
 from membrane_ctrl.model import clock
+from membrane_ctrl.model.numbers import parse_number
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
 TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
@@ -22,14 +22,15 @@ KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
 AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: the CA of the hold's certificate.")]
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is not a finite number")
-    return value
+def _number(text: str) -> float:
+    try:
+        return parse_number(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
-SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, um.", callback=_finite)]
-FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", callback=_finite)]
+SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, um.", parser=_number)]
+FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", parser=_number)]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]

@@ -268,6 +268,8 @@ def _page_words(page: WebConfig, run_dir: Path, socket: Path) -> list[str]:
     options = {"--users": page.users_file, "--certificate": page.certificate_file, "--key": page.key_file}
     given = [word for option, file in options.items() if file is not None for word in (option, file)]
     given += [word for name in page.names for word in ("--name", name)]
+    given += [word for proxy in page.trusted_proxies for word in ("--trusted-proxy", proxy)]
+    given += ["--public-url", page.public_url] if page.public_url else []
     where = ["--logs", str(run_dir.parent), "--socket", str(socket), "--host", page.host, "--port", str(page.port)]
     return ["web", "--with-hold", *where, *given]
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.numbers import parse_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +42,14 @@ def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> flo
 
 
 _SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
-_PART = re.compile(r"(\d+(?:\.\d+)?)([dhms])")
+_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
 
 
 def parse_duration_s(text: str) -> float:
     """Seconds of a positive duration such as `90`, `40s`, `3m`, `2h30m` or `1d`. Raises InputError."""
     compact = text.strip().lower().replace(" ", "")
     try:
-        seconds = float(compact)
+        seconds = parse_number(compact)
     except ValueError:
         parts = _PART.findall(compact)
         if not parts or "".join(number + unit for number, unit in parts) != compact:

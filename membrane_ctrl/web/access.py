@@ -1,50 +1,27 @@
-"""Who may see the page, and what a viewer may ask of a hold.
-
-The address bar is not enough: any program on this machine, and any page in a browser on it, can reach a port of
-localhost. So every request needs a session cookie, which a link with a secret or a password gives; requests with a
-foreign `Host` (DNS rebinding) or `Origin` (another page, also over web sockets) are refused, and the cookie is never
-sent by other sites (`SameSite=Strict`).
-"""
+"""Who may see the page, and what a viewer may ask of a hold (`login` asks each request for its session)."""
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import hmac
-import html
-import math
 import secrets
 import time
 from dataclasses import dataclass, field
 from functools import cache
-from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
-from urllib.parse import parse_qs, urlsplit
+from typing import Any, Literal, cast, get_args
 
 from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model import errors
-
-if TYPE_CHECKING:  # the doors know these actions, too, and have no web server
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from membrane_ctrl.model.numbers import parse_number
+from membrane_ctrl.web.login_throttle import Admission, Guess, LoginThrottle
 
 COOKIE = "membrane_ctrl"
 SESSION_S = 12 * 3600.0  # a shift; then log in again
-_FORM_BYTES_MAX = 4096
+DEVICE_COOKIE = "membrane_ctrl_device"
+_DEVICE_S = 180 * 86400.0
 # scrypt with these parameters takes 16 MB and some 50 ms: a guesser gets few tries, a person does not notice
 _SCRYPT = {"n": 2**14, "r": 8, "p": 1}
-_TRIES, _LOCKED_S = 5, 60.0  # wrong passwords in a row for a name, then this pause
-_SESSIONS_MAX = 1000
-
-_LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><title>membrane_ctrl</title>
-<meta name="viewport" content="width=device-width,initial-scale=1">
-<style>:root{{color-scheme:light dark}}body{{font:16px sans-serif;max-width:22em;margin:15vh auto;padding:0 1em}}
-input,button{{font:inherit;width:100%;padding:.5em;margin:.3em 0;box-sizing:border-box}}</style>
-<h1>membrane_ctrl</h1><p>{said}</p>{form}</html>"""
-_FORM = """<form method="post" action="/login">
-<label>Name<input name="name" autocomplete="username" autofocus></label>
-<label>Password<input name="password" type="password" autocomplete="current-password"></label>
-<button>Log in</button></form>"""
+_SESSIONS_MAX, _SESSIONS_OF_USER_MAX = 1000, 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,15 +85,18 @@ class Accounts:
 
     users: dict[str, KnownUser]
     link_role: Role = "tune"  # of whoever has the link; what the port grants limits it further
-    secure: bool = False  # the page is served over TLS
+    attributes: str = "HttpOnly; SameSite=Strict; Path=/"  # of the cookies (`PublicAddress.cookie_attributes`)
     secret: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+    throttle: LoginThrottle = field(default_factory=LoginThrottle)
     _sessions: dict[str, tuple[WebUser, float]] = field(default_factory=dict)
-    _wrong: dict[str, tuple[int, float]] = field(default_factory=dict)
 
     def session(self, user: WebUser) -> str:
         """Begin a session; returns its cookie's value."""
         now_s = time.monotonic()
         self._sessions = {key: (who, end_s) for key, (who, end_s) in self._sessions.items() if end_s > now_s}
+        own = [key for key, (who, _) in self._sessions.items() if who.name == user.name]
+        if len(own) >= _SESSIONS_OF_USER_MAX:  # who logs in again and again ends no sessions of others
+            del self._sessions[own[0]]
         while len(self._sessions) >= _SESSIONS_MAX:
             del self._sessions[next(iter(self._sessions))]
         key = secrets.token_urlsafe(32)
@@ -133,130 +113,62 @@ class Accounts:
         fits = not self.users and hmac.compare_digest(secret.encode(), self.secret.encode())
         return WebUser("link", self.link_role) if fits else None
 
-    def by_password(self, name: str, password: str) -> WebUser | None:
-        """Who logs in with this password; None if nobody, or after too many wrong ones."""
-        tries, since_s = self._wrong.get(name, (0, 0.0))
-        if tries >= _TRIES and time.monotonic() - since_s < _LOCKED_S:
-            return None
+    def by_password(self, name: str, password: str, source: str = "", device: str = "") -> WebUser | None:
+        """Who logs in with this password from a network address; None if nobody, or after too many wrong ones.
+
+        `device` is the value of a device's cookie.
+        """
+        guess = self.guess_of(name, source, device)
+        admission = self.throttle.admit(guess)
+        return self.evaluate(guess, password, admission) if admission.granted else None
+
+    def guess_of(self, name: str, source: str, device: str) -> Guess:
+        """Return who guesses; a device counts only if its cookie is of this account."""
         known = self.users.get(name)
-        salt, digest = (known.salt, known.digest) if known else (b"\0" * 16, b"")
-        if known is not None and hmac.compare_digest(_digest(password, salt), digest):
-            self._wrong.pop(name, None)
-            return WebUser(known.name, known.role, has_login=True)
+        if known is not None and _is_device_of(known, device):
+            return Guess(name, source, device)
+        return Guess(name, source)
+
+    def evaluate(self, guess: Guess, password: str, admission: Admission) -> WebUser | None:
+        """Compare the password of an admitted guess; slow. Returns None if it is wrong or the account is unknown."""
+        known = self.users.get(guess.account)
         if known is None:
-            _digest(password, salt)  # as slow as for a name that exists
-        else:
-            self._wrong[name] = tries + 1, time.monotonic()
-        return None
+            _digest(password, b"\0" * 16)  # as slow as for a name that exists
+            return None
+        if not hmac.compare_digest(_digest(password, known.salt), known.digest):
+            return None
+        self.throttle.note_success(guess, admission)
+        return WebUser(known.name, known.role, has_login=True)
 
-    def cookie(self, user: WebUser) -> str:
-        """The header that gives a user a session."""
-        secure = "; Secure" if self.secure else ""
-        return f"{COOKIE}={self.session(user)}; HttpOnly; SameSite=Strict; Path=/; Max-Age={SESSION_S:.0f}{secure}"
-
-
-class LoginMiddleware:
-    """ASGI middleware: lets in whoever has a session, and asks the others for the link or a password.
-
-    `scope["membrane_user"]` holds the `WebUser` of a request that was let in.
-    """
-
-    def __init__(self, app: ASGIApp, accounts: Accounts, hosts: frozenset[str]) -> None:
-        self._app, self._accounts, self._hosts = app, accounts, hosts
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        if refusal := self._foreign(headers):
-            await _answer(scope, send, HTTPStatus.FORBIDDEN, refusal)
-            return
-        user = self._accounts.user(_cookie(headers))
-        if user is not None:
-            await self._app({**scope, "membrane_user": user}, receive, _guarded(send))
-        elif scope["type"] == "http":
-            await self._ask(scope, receive, send)
-        else:
-            await _answer(scope, send, HTTPStatus.UNAUTHORIZED, "log in first")
-
-    def _foreign(self, headers: dict[str, str]) -> str:
-        """Why the request comes from elsewhere; empty if it does not."""
-        host = headers.get("host", "")
-        if urlsplit(f"//{host}").hostname not in self._hosts:
-            return "unknown host name: open the page by the address that `membrane-ctrl web` printed"
-        origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return "a request of another page"
-        return ""
-
-    async def _ask(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["method"] == "POST" and scope["path"] == "/login":
-            given = parse_qs((await _body(receive)).decode("utf-8", "replace"))
-            name, password = (given.get(key, [""])[0] for key in ("name", "password"))
-            user = await asyncio.to_thread(self._accounts.by_password, name, password)
-            said = "Name or password is wrong, or there were too many wrong ones: wait a minute."
-        else:
-            secret = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
-            user = self._accounts.by_link(secret)
-            said = "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
-            if secret and not self._accounts.users:
-                said = f"This link is wrong, or of an earlier start. {said}"
-        if user is not None:
-            headers = [(b"location", b"/"), (b"set-cookie", self._accounts.cookie(user).encode())]
-            await _answer(scope, send, HTTPStatus.SEE_OTHER, "", headers)
-        else:
-            form = _FORM if self._accounts.users else ""
-            page = _LOGIN.format(said=html.escape(said), form=form)
-            await _answer(scope, send, HTTPStatus.UNAUTHORIZED, page, [(b"content-type", b"text/html")])
+    def cookies(self, user: WebUser, device: str) -> list[str]:
+        """The headers that give a user a session and, with a login by name, remember the device if it is new."""
+        session = f"{COOKIE}={self.session(user)}; {self.attributes}; Max-Age={SESSION_S:.0f}"
+        known = self.users.get(user.name)
+        if known is None or _is_device_of(known, device):
+            return [session]
+        return [session, f"{DEVICE_COOKIE}={_new_device(known)}; {self.attributes}; Max-Age={_DEVICE_S:.0f}"]
 
 
-Header = tuple[bytes, bytes]
-_HEADERS: tuple[Header, ...] = (
-    (b"x-frame-options", b"DENY"),  # no other page may lay itself over the stop button
-    (b"x-content-type-options", b"nosniff"),
-    # the link's secret stays here; with `no-referrer` a browser would send the login form with the origin `null`
-    (b"referrer-policy", b"same-origin"),
-)
+# A device that has logged in before has its own budget of password guesses (`login_throttle`). Its cookie is a random
+# number with a signature. The key of the signature is made of the account's salt and hash: it needs no storage,
+# survives a restart, and ends with the password.
 
 
-def _guarded(send: Send) -> Send:
-    async def wrapped(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", ()), *_HEADERS]
-        await send(message)
-
-    return wrapped
+def _new_device(known: KnownUser) -> str:
+    """The cookie of a new device of an account."""
+    number = secrets.token_hex(16)
+    return f"{number}.{_device_signature(known, number)}"
 
 
-def _cookie(headers: dict[str, str]) -> str:
-    try:
-        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except CookieError:
-        return ""
-    return "" if found is None else found.value
+def _is_device_of(known: KnownUser, cookie: str) -> bool:
+    """Whether a device has logged in as this account since its password was set."""
+    number, _, signature = cookie.partition(".")
+    return hmac.compare_digest(signature.encode(), _device_signature(known, number).encode())
 
 
-async def _body(receive: Receive) -> bytes:
-    body = b""
-    while True:
-        message = await receive()
-        body += bytes(message.get("body", b""))
-        if len(body) > _FORM_BYTES_MAX:
-            return b""
-        if not message.get("more_body"):
-            return body
-
-
-async def _answer(
-    scope: Scope, send: Send, status: HTTPStatus, text: str, headers: list[Header] | None = None
-) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 4403, "reason": text[:100]})
-        return
-    start: Literal["http.response.start"] = "http.response.start"
-    await send({"type": start, "status": int(status), "headers": [*(headers or []), *_HEADERS]})
-    await send({"type": "http.response.body", "body": text.encode()})
+def _device_signature(known: KnownUser, number: str) -> str:
+    signed = f"device\0{known.name}\0{number}".encode()
+    return hmac.new(known.salt + known.digest, signed, hashlib.sha256).hexdigest()
 
 
 # What a viewer may ask: the commands of `ctl` that take one number or one text at most.
@@ -351,12 +263,9 @@ def request(action: Action, why: str, given: str, take_over: bool = False) -> di
     asked: dict[str, Any] = {"do": action.do, "why": why, "take_over": take_over}
     if action.asks == "number":
         try:
-            value = float(given.replace(",", "."))
-        except ValueError:
-            raise ValueError(f"{action.label}: enter a number in {action.unit}") from None
-        if not math.isfinite(value):
-            raise ValueError(f"{action.label}: enter a finite number in {action.unit}")
-        asked["value"] = value
+            asked["value"] = parse_number(given)
+        except ValueError as error:
+            raise ValueError(f"{action.label}: enter a number in {action.unit}: {error}") from None
     elif action.asks == "text":
         if not given.strip() and action.do == "mark":
             raise ValueError("Mark: enter a text")

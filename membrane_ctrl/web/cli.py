@@ -27,6 +27,12 @@ def web(
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
     name: Annotated[list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")] = None,
+    public_url: Annotated[
+        str, typer.Option("--public-url", metavar="URL", help="Address that browsers open, behind a reverse proxy.")
+    ] = "",
+    trusted_proxy: Annotated[
+        list[str] | None, typer.Option(metavar="ADDRESS", help="Proxy whose X-Forwarded-For counts; repeatable.")
+    ] = None,
     users: Annotated[Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")] = None,
     certificate: Annotated[Path | None, typer.Option("--certificate", help="TLS certificate of the page.")] = None,
     key: Annotated[Path | None, typer.Option("--key", help="Key of that certificate.")] = None,
@@ -47,6 +53,7 @@ def web(
             raise
         raise errors.InputError("web needs NiceGUI: pip install 'membrane-ctrl[web]'") from None
     given = {"host": host, "port": port, "names": tuple(name or ())}
+    given |= {"public_url": public_url, "trusted_proxies": tuple(trusted_proxy or ())}
     kept = {"users_file": users, "certificate_file": certificate, "key_file": key}
     page = parse(given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web")
     if with_hold:

@@ -15,6 +15,7 @@ from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files import shapes
 from membrane_ctrl.web.feed import UNITS, Series
+from membrane_ctrl.web.work_pools import WorkPool
 
 T = TypeVar("T")
 _GREY, _RULE = "#8a8a8a", "rgba(128, 128, 128, 0.3)"  # legible on white and on black
@@ -129,16 +130,24 @@ def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed:
 
 
 class Shared(Generic[T]):
-    """Makes a thing on a thread, once for all who ask for it within its life."""
+    """Makes a thing on a thread of a pool, once for all who ask for it within its life."""
 
-    def __init__(self, make: Callable[..., T], life_s: float) -> None:
-        self._make, self._life_s = make, life_s
+    def __init__(self, make: Callable[..., T], pool: WorkPool, life_s: float) -> None:
+        self._make, self._pool, self._life_s = make, pool, life_s
         self._made: dict[tuple[Hashable, ...], tuple[asyncio.Task[T], float]] = {}
 
     async def get(self, *key: Hashable) -> T:
         """What `make` returns, or raises, for these arguments."""
         now_s = time.monotonic()
-        self._made = {k: made for k, made in self._made.items() if made[1] > now_s or not made[0].done()}
+        self._made = {k: made for k, made in self._made.items() if _is_current(*made, now_s)}
         if key not in self._made:
-            self._made[key] = asyncio.create_task(asyncio.to_thread(self._make, *key)), now_s + self._life_s
+            self._made[key] = asyncio.create_task(self._pool.run(self._make, *key)), now_s + self._life_s
         return await asyncio.shield(self._made[key][0])  # a viewer who leaves takes it from nobody
+
+
+def _is_current(task: asyncio.Task[Any], end_s: float, now_s: float) -> bool:
+    """Whether a task still runs, or has made a thing that is not too old."""
+    if not task.done():
+        return True
+    failed = task.cancelled() or task.exception() is not None
+    return not failed and end_s > now_s

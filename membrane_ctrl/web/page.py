@@ -1,6 +1,5 @@
 """The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs before it."""
 
-import asyncio
 import contextlib
 import gzip
 import json
@@ -25,11 +24,13 @@ from membrane_ctrl.web.panels import (
     runs_panel,
     tell,
 )
+from membrane_ctrl.web.work_pools import FIGURES, LIVE_CHARTS, LONG_CHARTS, SESSIONS, PoolFullError, pool_of_command
 
 _LOOK_S = 1.0
 _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
+_LONG_CHART_LIFE_S = 30.0
 _FIGURES = (
     ("error", "error_um", "um", 2), ("setpoint", "setpoint_um", "um", 2), ("laser", "displacement_um", "um", 2),
     ("pump", "pump_fraction", "", 3), ("leak", "leak_um_per_s", "um/s", 3), ("trim", "trim_um", "um", 2),
@@ -50,13 +51,18 @@ class SharedViews:
 
     def __init__(self, feeds: Mapping[str, HoldFeed]) -> None:
         self._feeds = feeds
-        self.charts = figures.Shared(self._chart, life_s=_LOOK_S)
-        self.maps = figures.Shared(self._map, life_s=60.0)
+        self._live_charts = figures.Shared(self._chart, LIVE_CHARTS, life_s=_LOOK_S)
+        self._long_charts = figures.Shared(self._chart, LONG_CHARTS, life_s=_LONG_CHART_LIFE_S)
+        self.maps = figures.Shared(self._map, FIGURES, life_s=60.0)
         watches = {name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None}
-        self.sessions = figures.Shared(lambda hold: watches[hold].look(), life_s=_LOOK_S)
+        self.sessions = figures.Shared(lambda hold: watches[hold].look(), SESSIONS, life_s=_LOOK_S)
+
+    async def chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
+        """Options of the history chart, as JSON in gzip. Raises PoolFullError if too many are asked for."""
+        charts = self._live_charts if SPANS_S[span] in _CHART_EVERY_S else self._long_charts
+        return await charts.get(hold, signal, span, utc)
 
     def _chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
-        """Options of the history chart, as JSON in gzip."""
         feed, span_s = self._feeds[hold], SPANS_S[span]
         made = marks(feed, feed.logs, span_s)
         options = figures.chart(signal, history(feed, feed.logs, signal, span_s), utc, made)
@@ -210,7 +216,8 @@ class WebPage:
         if time.monotonic() - self._charted_s > _CHART_EVERY_S.get(span_s, 60.0):
             self._charted_s = time.monotonic()
             query = {"hold": self._hold, "signal": self._signal, "span": self._span, "utc": self._utc}
-            fetched = f"const answer = await fetch('/chart?{urlencode(query)}'); if (answer.ok)"
+            # the prefix of the public address, which NiceGUI puts into the page
+            fetched = f"const answer = await fetch(window.path_prefix + '/chart?{urlencode(query)}'); if (answer.ok)"
             drawn = f"runMethod({self._chart.id}, 'run_chart_method', ['setOption', await answer.json()])"
             with contextlib.suppress(TimeoutError):
                 await ui.run_javascript(f"{fetched} {drawn}", timeout=_FETCH_S)
@@ -260,7 +267,7 @@ class WebPage:
             given = None
             if action.asks:  # a hidden one would take the focus, and Enter with it
                 given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").classes("w-full")
-                given.props(f'autofocus inputmode="{"decimal" if action.asks == "number" else "text"}"')
+                given.props('autofocus inputmode="text"')  # a phone's decimal keys may lack the minus or the point
                 given.on("keydown.enter", lambda: dialog.submit("yes"))
             take_over = ui.checkbox("take command from whoever has it")
             with ui.row():
@@ -287,5 +294,8 @@ class WebPage:
             tell(str(error), good=False)
             return
         asked["on_behalf"] = on_behalf(self._user, self._session)
-        said = await asyncio.to_thread(self._feed.ask, asked)
+        try:
+            said = await pool_of_command(action.do).run(self._feed.ask, asked)
+        except PoolFullError as error:
+            said = f"{action.label}: not sent: {error}"
         tell(said, said.endswith(": done"))

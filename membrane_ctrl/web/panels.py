@@ -1,6 +1,5 @@
 """Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""
 
-import asyncio
 import math
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
 from membrane_ctrl.web.access import WebUser, outranks
 from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.web.work_pools import ANSWERS, REPORTS, RUN_LISTS, PoolFullError
 
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"
@@ -74,7 +74,7 @@ def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
     labels = {"hold": "mirror", "state": "state", "error": "error, um", "says": "alarms, or why"}
     columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in labels.items()]
     table = ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold").classes("w-full").props("dense")
-    link = '<a class="underline" :href="\'/?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'
+    link = '<a class="underline" :href="\'?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'
     table.add_slot("body-cell-hold", f'<q-td :props="props">{link}</q-td>')
 
     def look() -> None:
@@ -140,7 +140,7 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
     table.add_slot("no-data", '<span class="q-pa-sm">{{ props.message }}</span>')
 
     async def load() -> None:
-        table.rows = [_cells(line, utc()) for line in await asyncio.to_thread(run_lines, logs)]
+        table.rows = [_cells(line, utc()) for line in await RUN_LISTS.run(run_lines, logs)]
         table.props('no-data-label="no runs in this folder"')
         table.update()
 
@@ -156,7 +156,11 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
             return
         if not (folder / REPORT).exists():
             tell("Writing the report.")
-        if said := await asyncio.to_thread(report_problem, folder, user):
+        try:
+            said = await REPORTS.run(report_problem, folder, user)
+        except PoolFullError as error:
+            said = str(error)
+        if said:
             tell(said, good=False)
             return
         ui.navigate.to(f"/report/{folder.name}?hold={quote(hold)}", new_tab=True)
@@ -348,6 +352,6 @@ class TuningPanel:
         if not sure or not self._may():
             return
         given = PageAnswer(said, self._user.name)
-        outcome = await asyncio.to_thread(answered, seen.path, seen.progress.asks, given)
+        outcome = await ANSWERS.run(answered, seen.path, seen.progress.asks, given)
         with self._steps:  # the button that was pressed is gone once the session has its answer
             tell(outcome, outcome.endswith(": done"))

@@ -4,27 +4,34 @@ import asyncio
 import os
 import ssl
 import sys
+from functools import partial
 from pathlib import Path
 
 from fastapi import Request
-from fastapi.responses import HTMLResponse, Response
+from fastapi.responses import HTMLResponse, PlainTextResponse, Response
 from nicegui import app, ui
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.config.port import LOCAL_HOSTS, WebConfig
+from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.web.access import Accounts, LoginMiddleware, WebUser, known_users
+from membrane_ctrl.web.access import Accounts, WebUser, known_users
+from membrane_ctrl.web.connections import ConnectionGuard, GuardedHttp, raise_file_limit
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, HoldFeed
 from membrane_ctrl.web.figures import REMOVED
+from membrane_ctrl.web.login import LoginMiddleware
 from membrane_ctrl.web.page import SharedViews, WebPage
 from membrane_ctrl.web.panels import REPORT, run_folder
+from membrane_ctrl.web.public_address import public_address
+from membrane_ctrl.web.stop_route import stop_handler
+from membrane_ctrl.web.work_pools import REPORT_FILES, PoolFullError
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 _AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
 _STUCK_S = 20.0  # for a message to leave
 _REPORT_BYTES_MAX = 64_000_000
+_MESSAGE_BYTES_MAX = 1_000_000  # of a browser over its web socket; the page has no uploads
 _FRESH = {"cache-control": "no-store"}
 
 
@@ -38,7 +45,7 @@ def accounts_of(page: WebConfig) -> Accounts:
             raise errors.InputError(f"{page.users_file}: {error}") from None
         if not users:
             raise errors.InputError(f"{page.users_file}: no users; add one with `membrane-ctrl web add-user`")
-    return Accounts(users, secure=page.secure)
+    return Accounts(users, attributes=public_address(page).cookie_attributes)
 
 
 def require_servable(page: WebConfig) -> None:
@@ -54,10 +61,18 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     accounts = accounts_of(page)
     require_servable(page)
     os.nice(max(0, _NICE - os.nice(0)))
-    hosts = frozenset({*LOCAL_HOSTS, page.host, *page.names})
+    raise_file_limit()
+    address = public_address(page)
     feeds = {name: HoldFeed(where) for name, where in holds.items()}
-    app.add_middleware(HangUp)  # inside the login: the last added comes first
-    app.add_middleware(LoginMiddleware, accounts=accounts, hosts=hosts)
+    guard = ConnectionGuard()
+    build_inside = app.build_middleware_stack
+
+    def build_middleware_stack() -> ASGIApp:
+        """Put the login outside of everything: NiceGUI adds middlewares later than we could with `add_middleware`."""
+        inside = HangUp(build_inside())
+        return LoginMiddleware(inside, accounts, address, stop_handler(feeds), guard)
+
+    app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
     for feed in feeds.values():
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)
@@ -73,7 +88,10 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     async def chart(hold: str, signal: str, span: str, utc: bool) -> Response:
         if hold not in feeds or signal not in SIGNALS or span not in SPANS_S:
             return Response(status_code=404)
-        packed = await views.charts.get(hold, signal, span, utc)
+        try:
+            packed = await views.chart(hold, signal, span, utc)
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
         return Response(packed, media_type="application/json", headers={**_FRESH, "content-encoding": "gzip"})
 
     @app.get("/map")
@@ -85,13 +103,14 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         return Response(drawn.png, media_type="image/png", headers=_FRESH)
 
     @app.get("/report/{name}")
-    def report(name: str, hold: str = "") -> HTMLResponse:
+    async def report(name: str, hold: str = "") -> Response:
         logs = feeds[hold].logs if hold in feeds else None
-        return report_page(logs, name)
+        try:
+            return await REPORT_FILES.run(report_page, logs, name)
+        except PoolFullError as error:
+            return PlainTextResponse(str(error), 503)
 
-    scheme = "https" if page.secure else "http"
-    host = f"[{page.host}]" if ":" in page.host else page.host
-    link = f"{scheme}://{host}:{page.port}/" + ("" if accounts.users else f"?key={accounts.secret}")
+    link = address.base_url + ("" if accounts.users else f"?key={accounts.secret}")
     print(f"membrane-ctrl web: open {link}", file=sys.stderr, flush=True)
     ui.run(
         host=page.host,
@@ -105,6 +124,10 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         ssl_certfile=page.certificate_file,
         ssl_keyfile=page.key_file,
         ws_per_message_deflate=False,  # updates are small; fifty compressors are not
+        ws_max_size=_MESSAGE_BYTES_MAX,
+        http=partial(GuardedHttp, guard),
+        loop="membrane_ctrl.web.connections:PageLoop" if page.secure else "auto",
+        proxy_headers=False,  # `PublicAddress.source_of` reads them, if the proxy is a trusted one
     )
 
 
@@ -144,7 +167,7 @@ def report_page(logs: Path | None, name: str) -> HTMLResponse:
         return HTMLResponse("no such run", 404)
     try:
         text = files.read_bytes(folder / REPORT, _REPORT_BYTES_MAX).decode("utf-8", "replace")
-    except OSError:
+    except (OSError, ValueError):  # ValueError: a name that no file can have
         return HTMLResponse("no report yet", 404)
     sandbox = "sandbox allow-scripts; default-src 'unsafe-inline' data:"
     return HTMLResponse(text, headers={"content-security-policy": sandbox})

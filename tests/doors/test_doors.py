@@ -145,7 +145,7 @@ async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
     ("command", "given", "says"),
     [
         ("setpoint", "", "enter a number"),
-        ("setpoint", "nan", "finite"),
+        ("setpoint", "nan", "enter a number in um: 'nan' is not a plain decimal number"),
         ("setpoint", "1e9", "outside the limits"),
         ("mark", "a\nb", "printable"),
         ("mark", "x" * 501, "longer than 500 bytes"),

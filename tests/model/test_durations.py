@@ -16,7 +16,26 @@ def test_understood(text: str, seconds: float) -> None:
     assert parse_duration_s(text) == seconds
 
 
-@pytest.mark.parametrize("text", ["", "0", "-3m", "3 weeks", "m3", "nan", "inf", "3m!"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "0",
+        "-3m",
+        "3 weeks",
+        "m3",
+        "nan",
+        "inf",
+        "3m!",
+        "1_0",
+        "\u0663",
+        "1_0s",
+        "\u0663m",
+        "1,5",
+        "1e400",
+        "9" * 70,
+    ],
+)
 def test_refused(text: str) -> None:
     with pytest.raises(InputError, match="duration"):
         parse_duration_s(text)

@@ -69,7 +69,7 @@ async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
 
 
 def test_every_action_is_one_that_the_port_reads() -> None:
-    given = {"number": "3,5", "text": "why not", "": ""}
+    given = {"number": "3.5", "text": "why not", "": ""}
     for action in (*ACTIONS, UNLOCK, STOP):
         asked = request(action, "web: anna", given[action.asks])
         read = parse(encode({**asked, "number": 1}))
@@ -108,7 +108,9 @@ def test_the_lesser_of_both_roles_counts(user: str, port: str, allowed: bool) ->
     assert may(WebUser("anna", "operate"), "tune", keep) is False
 
 
-@pytest.mark.parametrize("text", ["", "x", "nan", "inf", "1e999", "1;2"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "nan", "inf", "1e999", "1;2", "1,000", "3,5", "1_0", "\u0663", "0x10", " 1"]
+)
 def test_what_is_no_number_is_not_sent(text: str) -> None:
     setpoint = next(action for action in ACTIONS if action.do == "setpoint")
     with pytest.raises(ValueError, match="Setpoint: enter a"):

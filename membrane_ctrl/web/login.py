@@ -1,0 +1,306 @@
+"""Asks each request for its session, and refuses what is malformed or comes from elsewhere.
+
+The address bar is not enough: any program on this machine, and any page in a browser on it, can reach a port of
+localhost. So every request needs a session cookie, which a link with a secret or a password gives; requests with a
+foreign `Host` (DNS rebinding) or `Origin` (another page, also over web sockets) are refused, and the cookie is never
+sent by other sites (`SameSite=Strict`).
+
+Strangers share the event loop with viewers, so what they may cause is bounded: a request of a stranger costs a few
+comparisons, the body of a login is short and in time, and passwords are evaluated in pools of their own after the
+throttle has admitted them (429), or not at all while too many wait (503).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import Literal
+from urllib.parse import parse_qs
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from membrane_ctrl.web.access import COOKIE, DEVICE_COOKIE, Accounts, WebUser
+from membrane_ctrl.web.connections import ConnectionGuard
+from membrane_ctrl.web.public_address import PublicAddress, host_name
+from membrane_ctrl.web.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
+
+LOGIN_PATH = "/login"
+STOP_PATH = "/stop"
+_FORM_BYTES_MAX = 4096
+_FORM_S = 5.0
+_TARGET_LENGTH_MAX = 4096
+_HEAD_BYTES_MAX = 32_768
+_BUSY_S = 1.0  # until passwords that wait have been evaluated
+
+Header = tuple[bytes, bytes]
+StopHandler = Callable[[WebUser, str], Awaitable[tuple[HTTPStatus, str]]]
+
+_LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><title>membrane_ctrl</title>
+<meta name="viewport" content="width=device-width,initial-scale=1">
+<style>:root{{color-scheme:light dark}}body{{font:16px sans-serif;max-width:22em;margin:15vh auto;padding:0 1em}}
+input,button{{font:inherit;width:100%;padding:.5em;margin:.3em 0;box-sizing:border-box}}</style>
+<h1>membrane_ctrl</h1><p>{said}</p>{form}</html>"""
+_FORM = """<form method="post" action="{action}">
+<label>Name<input name="name" autocomplete="username" autofocus></label>
+<label>Password<input name="password" type="password" autocomplete="current-password"></label>
+<button>Log in</button></form>"""
+
+
+_HEADERS: tuple[Header, ...] = (
+    (b"x-frame-options", b"DENY"),  # no other page may lay itself over the stop button
+    (b"x-content-type-options", b"nosniff"),
+    # the link's secret stays here; with `no-referrer` a browser would send the login form with the origin `null`
+    (b"referrer-policy", b"same-origin"),
+)
+_CLOSE: Header = (b"connection", b"close")
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a request is not answered."""
+
+    status: HTTPStatus
+    text: str
+
+
+class LoginMiddleware:
+    """ASGI middleware: lets in whoever has a session, and asks the others for the link or a password.
+
+    `scope["membrane_user"]` holds the `WebUser` of a request that was let in.
+
+    Parameters
+    ----------
+    app
+        The page.
+    accounts
+        Who may log in.
+    address
+        Where browsers find the page.
+    stop
+        Stops the hold of a name. `POST /stop` is answered here, before the page's own routes.
+    guard
+        The connections of strangers.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        accounts: Accounts,
+        address: PublicAddress,
+        stop: StopHandler | None = None,
+        guard: ConnectionGuard | None = None,
+    ) -> None:
+        self._app, self._accounts, self._address, self._stop = app, accounts, address, stop
+        self._guard = guard or ConnectionGuard()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = _texts(scope)
+        refusal = malformation(scope) or self._foreign(headers)
+        if refusal is not None:
+            await self._refuse(scope, send, refusal)
+            return
+        cookies = _cookies(headers)
+        user = self._accounts.user(cookies.get(COOKIE, ""))
+        if user is not None:
+            self._guard.mark_known(scope.get("client"))
+        if scope.get("method") == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH:
+            await self._log_in(scope, receive, send, cookies.get(DEVICE_COOKIE, ""))
+        elif user is not None:
+            await self._serve(self._inside(scope, user), receive, send)
+        elif scope["type"] == "websocket":
+            await self._refuse(scope, send, Refusal(HTTPStatus.UNAUTHORIZED, "log in first"))
+        else:
+            await self._open_link(scope, send)
+
+    async def _refuse(self, scope: Scope, send: Send, refusal: Refusal) -> None:
+        """Answer with an error and end the connection."""
+        await _answer(scope, send, refusal.status, refusal.text, [_CLOSE])
+        if scope["type"] == "websocket" and scope.get("client") is not None:
+            self._guard.remove(scope["client"])
+
+    def _foreign(self, headers: dict[str, str]) -> Refusal | None:
+        """Return why the request comes from elsewhere; None if it does not."""
+        host = headers.get("host", "")
+        name = host_name(host)
+        if host and name is None:
+            return Refusal(HTTPStatus.BAD_REQUEST, "malformed Host header")
+        if name not in self._address.hosts:
+            hint = "unknown host name: open the page by the address that `membrane-ctrl web` printed"
+            return Refusal(HTTPStatus.FORBIDDEN, hint)
+        origin = headers.get("origin")
+        if origin is not None and not self._address.admits_origin(origin, host):
+            return Refusal(HTTPStatus.FORBIDDEN, "a request of another page")
+        return None
+
+    def _inside(self, scope: Scope, user: WebUser) -> Scope:
+        """Return the request as the page sees it: its path without the prefix, and the prefix from the settings."""
+        path = self._address.path_inside(scope["path"])
+        raw_path = self._address.path_inside(scope.get("raw_path", b"").decode("latin-1"))
+        headers = [each for each in scope["headers"] if each[0] != b"x-forwarded-prefix"]
+        if self._address.prefix:  # NiceGUI puts the prefix of this header into its links
+            headers.append((b"x-forwarded-prefix", self._address.prefix.encode()))
+        changed = {"path": path, "raw_path": raw_path.encode("latin-1"), "headers": headers, "membrane_user": user}
+        return {**scope, **changed}
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a viewer."""
+        if scope["path"] == "":  # the address without its last slash: links of the page are relative to it
+            await _answer(scope, send, HTTPStatus.PERMANENT_REDIRECT, "", [self._location()])
+        elif self._stop is not None and scope["path"] == STOP_PATH and scope.get("method") == "POST":
+            query = parse_qs(scope["query_string"].decode("latin-1"))
+            status, text = await self._stop(scope["membrane_user"], query.get("hold", [""])[0])
+            await _answer(scope, send, status, f"{text}\n", [_text_type("plain")])
+        else:
+            await self._app(scope, receive, _guarded(send))
+
+    async def _log_in(self, scope: Scope, receive: Receive, send: Send, device: str) -> None:
+        """Evaluate a name and a password."""
+        body = await _form_body(receive)
+        if isinstance(body, Refusal):
+            await self._refuse(scope, send, body)
+            return
+        given = parse_qs(body.decode("utf-8", "replace"))
+        name, password = (given.get(key, [""])[0] for key in ("name", "password"))
+        guess = self._accounts.guess_of(name, self._source(scope), device)
+        admission = self._accounts.throttle.admit(guess)
+        if not admission.granted:
+            text = f"Too many tries. Wait {math.ceil(admission.wait_s)} s."
+            await self._show_form(scope, send, HTTPStatus.TOO_MANY_REQUESTS, text, admission.wait_s)
+            return
+        pool = KNOWN_PASSWORDS if guess.device else STRANGERS_PASSWORDS
+        try:
+            user = await pool.run(self._accounts.evaluate, guess, password, admission)
+        except PoolFullError:
+            self._accounts.throttle.withdraw(admission)
+            text = "Too many people are logging in. Try again."
+            await self._show_form(scope, send, HTTPStatus.SERVICE_UNAVAILABLE, text, _BUSY_S)
+            return
+        if user is None:
+            await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, "Name or password is wrong.")
+            return
+        await self._admit(scope, send, user, device)
+
+    async def _open_link(self, scope: Scope, send: Send) -> None:
+        """Let in whoever has the link's secret; show the others how to get in."""
+        secret = parse_qs(scope["query_string"].decode("latin-1")).get("key", [""])[0]
+        user = self._accounts.by_link(secret)
+        if user is not None:
+            await self._admit(scope, send, user, "")
+            return
+        text = "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
+        if secret and not self._accounts.users:
+            text = f"This link is wrong, or of an earlier start. {text}"
+        await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, text)
+
+    async def _admit(self, scope: Scope, send: Send, user: WebUser, device: str) -> None:
+        """Give a user a session and show the page."""
+        cookies = [(b"set-cookie", each.encode()) for each in self._accounts.cookies(user, device)]
+        await _answer(scope, send, HTTPStatus.SEE_OTHER, "", [self._location(), *cookies])
+
+    async def _show_form(
+        self, scope: Scope, send: Send, status: HTTPStatus, text: str, retry_s: float | None = None
+    ) -> None:
+        """Answer with the form, or with what to do without one."""
+        form = _FORM.format(action=f"{self._address.prefix}/login") if self._accounts.users else ""
+        page = _LOGIN.format(said=html.escape(text), form=form)
+        headers = [_text_type("html")]
+        if retry_s is not None:
+            headers.append((b"retry-after", str(math.ceil(retry_s)).encode()))
+        read = scope["method"] == "POST" and self._address.path_inside(scope["path"]) == LOGIN_PATH
+        if _has_body(scope) and not read:
+            headers.append(_CLOSE)  # the body of a request that is not read would still be received
+        await _answer(scope, send, status, page, headers)
+
+    def _location(self) -> Header:
+        return (b"location", self._address.home.encode())
+
+    def _source(self, scope: Scope) -> str:
+        """Return the network address of the client."""
+        peer = (scope.get("client") or ("", 0))[0]
+        forwarded = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
+        return self._address.source_of(peer, forwarded)
+
+
+def malformation(scope: Scope) -> Refusal | None:
+    """Return what is wrong with the form of a request; None if nothing is."""
+    names = [name for name, _ in scope["headers"]]
+    if names.count(b"host") > 1 or names.count(b"origin") > 1:
+        return Refusal(HTTPStatus.BAD_REQUEST, "a header that must be unique is repeated")
+    if sum(len(name) + len(value) for name, value in scope["headers"]) > _HEAD_BYTES_MAX:
+        return Refusal(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too many headers")
+    if max(len(scope["path"]), len(scope["query_string"])) > _TARGET_LENGTH_MAX:
+        return Refusal(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
+    if not scope["path"].isprintable() or "\ufffd" in scope["path"]:
+        return Refusal(HTTPStatus.BAD_REQUEST, "control characters or broken text in the address")
+    return None
+
+
+def _text_type(kind: Literal["plain", "html"]) -> Header:
+    return (b"content-type", f"text/{kind}; charset=utf-8".encode())
+
+
+def _texts(scope: Scope) -> dict[str, str]:
+    """Return the headers as text; of repeated ones, the last."""
+    return {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+
+
+def _has_body(scope: Scope) -> bool:
+    return any(name in (b"content-length", b"transfer-encoding") for name, _ in scope["headers"])
+
+
+def _guarded(send: Send) -> Send:
+    """Add the headers that protect the page to an answer."""
+
+    async def wrapped(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message.get("headers", ()), *_HEADERS]
+        await send(message)
+
+    return wrapped
+
+
+def _cookies(headers: dict[str, str]) -> dict[str, str]:
+    try:
+        cookies = SimpleCookie(headers.get("cookie", ""))
+    except CookieError:
+        return {}
+    return {name: morsel.value for name, morsel in cookies.items()}
+
+
+async def _form_body(receive: Receive) -> bytes | Refusal:
+    """Receive the body of the login form."""
+    body = b""
+    try:
+        async with asyncio.timeout(_FORM_S):
+            while True:
+                message = await receive()
+                if message["type"] == "http.disconnect":
+                    return Refusal(HTTPStatus.BAD_REQUEST, "the client left")
+                body += bytes(message.get("body", b""))
+                if len(body) > _FORM_BYTES_MAX:
+                    return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the form is too long")
+                if not message.get("more_body"):
+                    return body
+    except TimeoutError:
+        return Refusal(HTTPStatus.REQUEST_TIMEOUT, f"the form did not arrive within {_FORM_S:g} s")
+
+
+async def _answer(
+    scope: Scope, send: Send, status: HTTPStatus, text: str, headers: list[Header] | None = None
+) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 4403, "reason": text[:100]})
+        return
+    content = text.encode()
+    start: Literal["http.response.start"] = "http.response.start"
+    length = (b"content-length", str(len(content)).encode())
+    await send({"type": start, "status": int(status), "headers": [*(headers or []), length, *_HEADERS]})
+    await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else content})

@@ -1,0 +1,86 @@
+"""Bounded pools of threads: one kind of work never waits behind another kind.
+
+The page does its slow work on threads: password hashes, charts, reports, commands to a hold. In one common pool, a
+few slow tasks of one kind would delay all others. So each kind has its own pool, with a bound on the tasks that wait;
+a task beyond that bound is refused at once. Commands that end in the safe state have a pool for themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class PoolFullError(RuntimeError):
+    """As many tasks of this kind are running and waiting as its pool admits."""
+
+
+class WorkPool:
+    """Threads for one kind of work.
+
+    Parameters
+    ----------
+    name
+        Kind of work, for the names of the threads.
+    workers
+        Tasks that run at the same time.
+    waiting_max
+        Tasks that may wait for a thread.
+    niceness
+        Added to the niceness of the process, for work that should yield to everything else.
+    """
+
+    def __init__(self, name: str, workers: int, waiting_max: int, niceness: int = 0) -> None:
+        self.name = name
+        self._tasks_max = workers + waiting_max
+        self._tasks = 0
+        self._lock = threading.Lock()
+        # on Linux, `os.nice` changes the calling thread only
+        self._threads = ThreadPoolExecutor(workers, f"page {name}", initializer=os.nice, initargs=(niceness,))
+
+    async def run(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Return what the function returns, or raise what it raises. Raises PoolFullError if too many tasks wait."""
+        with self._lock:
+            if self._tasks >= self._tasks_max:
+                raise PoolFullError(f"{self.name}: too many requests are waiting; try again")
+            self._tasks += 1
+        try:
+            task = self._threads.submit(function, *arguments)
+        except BaseException:
+            self._count_end()
+            raise
+        task.add_done_callback(self._count_end)
+        return await asyncio.wrap_future(task)
+
+    def _count_end(self, _: Future[Any] | None = None) -> None:
+        with self._lock:
+            self._tasks -= 1
+
+
+# A password hash takes 16 MB and 50 ms of a core. Devices that have logged in before do not queue behind strangers.
+STRANGERS_PASSWORDS = WorkPool("strangers' passwords", workers=1, waiting_max=8, niceness=5)
+KNOWN_PASSWORDS = WorkPool("known devices' passwords", workers=1, waiting_max=8, niceness=5)
+# Charts of the last hour come from memory, longer ones from the files of many runs.
+LIVE_CHARTS = WorkPool("live charts", workers=2, waiting_max=100)
+LONG_CHARTS = WorkPool("long charts", workers=1, waiting_max=100, niceness=5)
+FIGURES = WorkPool("figures", workers=1, waiting_max=100)
+SESSIONS = WorkPool("tuning sessions", workers=1, waiting_max=100)
+ANSWERS = WorkPool("answers to tuning sessions", workers=2, waiting_max=16)
+RUN_LISTS = WorkPool("lists of runs", workers=1, waiting_max=20, niceness=5)
+REPORTS = WorkPool("reports", workers=1, waiting_max=8, niceness=5)
+REPORT_FILES = WorkPool("report files", workers=1, waiting_max=20, niceness=5)
+COMMANDS = WorkPool("commands", workers=4, waiting_max=32)
+SAFETY_COMMANDS = WorkPool("safety commands", workers=8, waiting_max=32)
+
+_SAFETY = frozenset({"stop", "vent", "lower", "latch"})
+
+
+def pool_of_command(do: str) -> WorkPool:
+    """Return the pool for a command to a hold; commands that end in the safe state have their own."""
+    return SAFETY_COMMANDS if do in _SAFETY else COMMANDS

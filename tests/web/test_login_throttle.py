@@ -1,0 +1,201 @@
+"""Guesses are limited for each source and account, and no guess of a stranger keeps the owner out."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from membrane_ctrl.web import access, login_throttle
+from membrane_ctrl.web.access import Accounts, KnownUser
+from membrane_ctrl.web.login_throttle import Guess, LoginThrottle
+
+RIGHT, WRONG = "correct horse", "wrong wrong"
+
+
+class Clock:
+    """Time that the test moves."""
+
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("time.monotonic", made)
+    return made
+
+
+@pytest.fixture
+def evaluated(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The passwords that were hashed, by a function that takes no time."""
+    found: list[str] = []
+
+    def digest(password: str, salt: bytes) -> bytes:
+        found.append(password)
+        return password.encode() + salt
+
+    monkeypatch.setattr(access, "_digest", digest)
+    return found
+
+
+def accounts() -> Accounts:
+    return Accounts({
+        name: KnownUser(name, "operate", name.encode(), RIGHT.encode() + name.encode()) for name in ("anna", "bob")
+    })  # fmt: skip
+
+
+def device_of(found: Accounts, name: str) -> str:
+    """The cookie of a device that has logged in."""
+    user = found.by_password(name, RIGHT, source=f"home of {name}")
+    assert user is not None
+    _, device = found.cookies(user, "")
+    return device.partition("=")[2].partition(";")[0]
+
+
+def test_one_wrong_password_a_minute_keeps_nobody_out(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    for _ in range(5):
+        found.by_password("anna", WRONG)
+    for _ in range(60):
+        clock.now_s += 61.0
+        assert found.by_password("anna", WRONG) is None
+        clock.now_s += 1.0
+        assert found.by_password("anna", RIGHT) is not None
+
+
+def test_guesses_from_one_address_are_limited_over_time(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    for _ in range(3600):
+        found.by_password("anna", WRONG, "198.51.100.7")
+        clock.now_s += 1.0
+    assert 290 <= len(evaluated) <= 310, "5 at once, then one every 12 s"
+
+
+def test_an_attack_from_one_address_leaves_other_addresses_alone(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    for number in range(2000):
+        found.by_password("anna", f"guess {number}", "198.51.100.7")
+        clock.now_s += 0.1
+        if number % 100 == 0:
+            assert found.by_password("anna", RIGHT, f"10.0.0.{number // 100}") is not None
+
+
+def test_an_attack_from_many_addresses_is_limited_and_leaves_a_new_address_its_first_tries(
+    clock: Clock, evaluated: list[str]
+) -> None:
+    found = accounts()
+    for number in range(20_000):
+        found.by_password("anna", WRONG, f"198.51.100.{number % 200}")
+        clock.now_s += 0.01
+    assert len(evaluated) <= 2 * 200 + 60 + 200, "first tries of each address, then the budget of the account"
+    assert found.by_password("anna", RIGHT, "10.0.0.1") is not None
+    assert found.by_password("anna", WRONG, "10.0.0.2") is None
+    assert found.by_password("anna", RIGHT, "10.0.0.2") is not None, "the owner may mistype once"
+
+
+def test_a_device_that_has_logged_in_has_its_own_budget(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    device = device_of(found, "anna")
+    for number in range(1000):
+        found.by_password("anna", WRONG, "127.0.0.1")
+        clock.now_s += 0.01
+        if number % 100 == 0:
+            assert found.by_password("anna", RIGHT, "127.0.0.1", device) is not None
+    evaluated.clear()
+    for _ in range(100):
+        assert found.by_password("anna", WRONG, "127.0.0.1", device) is None
+    assert len(evaluated) == 5, "a stolen device is limited, too"
+
+
+@pytest.mark.parametrize("made", ["other", "forged", "cut", "empty"])
+def test_a_device_counts_for_its_own_account_only(made: str, clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    own = device_of(found, "anna")
+    devices = {"other": device_of(found, "bob"), "forged": own[:-1] + ("0" if own[-1] != "0" else "1"), "cut": "x.",
+               "empty": ""}  # fmt: skip
+    evaluated.clear()
+    for _ in range(50):
+        found.by_password("anna", WRONG, "198.51.100.7", devices[made])
+    assert len(evaluated) == 5
+
+
+def test_a_device_ends_with_the_password_and_survives_a_restart(clock: Clock, evaluated: list[str]) -> None:
+    device = device_of(accounts(), "anna")
+    assert accounts().guess_of("anna", "a", device).device == device
+    changed = Accounts({"anna": KnownUser("anna", "operate", b"anna", b"another password")})
+    assert changed.guess_of("anna", "a", device).device == ""
+
+
+def test_parallel_guesses_are_all_counted(evaluated: list[str]) -> None:
+    found = accounts()
+    begin = threading.Barrier(40)
+
+    def guess() -> None:
+        begin.wait()
+        found.by_password("anna", WRONG)
+
+    threads = [threading.Thread(target=guess) for _ in range(40)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(evaluated) == 5
+
+
+def test_an_unknown_name_costs_and_waits_as_a_known_one(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    for _ in range(50):
+        assert found.by_password("nobody", RIGHT, "198.51.100.7") is None
+    assert len(evaluated) == 5
+
+
+def test_many_names_from_one_address_share_its_budget(clock: Clock, evaluated: list[str]) -> None:
+    found = accounts()
+    for number in range(1000):
+        found.by_password(f"name {number}", WRONG, "198.51.100.7")
+    assert len(evaluated) == 20
+
+
+def test_a_guess_that_was_not_evaluated_is_not_counted(clock: Clock) -> None:
+    throttle = LoginThrottle()
+    guess = Guess("anna", "198.51.100.7")
+    for _ in range(500):
+        admission = throttle.admit(guess)
+        assert admission.granted
+        throttle.withdraw(admission)
+    granted = [throttle.admit(guess).granted for _ in range(20)]
+    assert granted.count(True) == 5, "withdrawing gives no more than was taken"
+
+
+def test_the_wait_is_as_long_as_it_says(clock: Clock) -> None:
+    throttle = LoginThrottle()
+    guess = Guess("anna", "198.51.100.7")
+    while throttle.admit(guess).granted:
+        pass
+    wait_s = throttle.admit(guess).wait_s
+    assert 0.0 < wait_s <= 12.0
+    clock.now_s += 0.99 * wait_s
+    assert not throttle.admit(guess).granted
+    clock.now_s += 0.02 * wait_s
+    assert throttle.admit(guess).granted
+
+
+def test_memory_of_the_throttle_is_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(login_throttle, "_KEYS_MAX", 100)
+    throttle = LoginThrottle()
+    for number in range(1000):
+        throttle.admit(Guess(f"name {number}", f"source {number}"))
+    assert max(len(budgets._tokens) for budgets in (throttle._source, throttle._source_and_account)) <= 100
+
+
+def test_who_logs_in_again_and_again_ends_no_session_of_others() -> None:
+    found = accounts()
+    other = found.session(access.WebUser("bob", "read"))
+    for _ in range(2000):
+        newest = found.session(access.WebUser("anna", "operate"))
+    assert found.user(other) is not None
+    assert found.user(newest) is not None

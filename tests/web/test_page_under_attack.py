@@ -1,0 +1,113 @@
+"""Strangers cannot delay a logged-in user, keep an owner out, or make the page fail."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.web.access import known_user
+from tests.control_port.port_run import PortRun, port_run
+from tests.support.service_attacks import ATTACKS, ROUTES, Viewer, attack
+from tests.web.test_page import served, ticking
+
+PASSWORD = "correct horse"
+STOP_S = 1.0
+CHART_S = 3.0  # also on a busy machine
+
+
+@asynccontextmanager
+async def serving(folder: Path, *options: str) -> AsyncIterator[tuple[PortRun, str]]:
+    """A hold and its page with two accounts; yields the hold and the page's address."""
+    users = folder / "users"
+    lines = [known_user(name, role, PASSWORD).line() for name, role in (("anna", "operate"), ("bob", "read"))]
+    users.write_text("\n".join(lines))
+    async with port_run(folder) as run, served(folder, "--users", str(users), *options) as url:
+        ticks = asyncio.create_task(ticking(run))
+        try:
+            await asyncio.sleep(1.0)
+            yield run, url
+        finally:
+            ticks.cancel()
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("name", sorted(ATTACKS))
+async def test_strangers_delay_neither_chart_nor_stop(name: str, tmp_path: Path) -> None:
+    async with serving(tmp_path) as (run, url), Viewer(url) as anna:
+        assert await anna.log_in("anna", PASSWORD) == 303
+        async with attack(name, url, clients=100 if name != "silence" else 2000):
+            charts_s = await anna.latencies_s(ROUTES.live, 8)
+            stops_s = await anna.latencies_s(ROUTES.stop, 8, method="POST")
+            async with Viewer(url) as other:  # on a new connection
+                other.client.cookies = anna.client.cookies
+                stops_s += await other.latencies_s(ROUTES.stop, 1, method="POST")
+        assert max(charts_s) < CHART_S, charts_s
+        assert max(stops_s) < STOP_S, stops_s
+        assert [command.kind for command in run.asked] == ["stop"] * 9
+
+
+@pytest.mark.real_time
+async def test_a_user_who_asks_for_everything_delays_no_other(tmp_path: Path) -> None:
+    signals = ("error_um", "displacement_um", "pump_fraction", "leak_um_per_s", "gauge_pressure_pa", "trim_um")
+    spans = ("1 min", "10 min", "1 h", "8 h", "1 day", "1 week", "1 month")
+    paths = [
+        ROUTES.history.format(signal=signal, span=span, utc=utc)
+        for signal in signals for span in spans for utc in ("true", "false")
+    ]  # fmt: skip
+
+    async with serving(tmp_path) as (_, url), Viewer(url) as anna, Viewer(url) as bob:
+        assert await anna.log_in("anna", PASSWORD) == 303
+        assert await bob.log_in("bob", PASSWORD) == 303
+
+        async def ask_for_everything() -> None:
+            while True:
+                await asyncio.gather(*(bob.client.get(path) for path in paths))
+
+        greedy = asyncio.create_task(ask_for_everything())
+        await asyncio.sleep(2.0)
+        stops_s = await anna.latencies_s(ROUTES.stop, 10, method="POST")
+        assert not greedy.done(), greedy
+        greedy.cancel()
+        assert max(stops_s) < STOP_S, stops_s
+
+
+@pytest.mark.real_time
+async def test_the_owner_gets_in_while_the_name_is_attacked(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, url), Viewer(url) as anna:
+        assert await anna.log_in("anna", PASSWORD) == 303
+        anna.client.cookies.delete("membrane_ctrl")  # the session has ended; the device is the same
+        async with attack("owner", url, clients=40):
+            statuses = [await anna.log_in("anna", PASSWORD) for _ in range(8)]
+            assert statuses == [303] * 8
+            async with Viewer(url) as stranger:
+                assert await stranger.log_in("anna", "guess guess") in (429, 503)
+
+
+@pytest.mark.real_time
+async def test_parallel_guesses_are_counted(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (_, url), Viewer(url) as stranger:
+        tries = [stranger.log_in("anna", f"guess {number:03}") for number in range(40)]
+        statuses = await asyncio.gather(*tries)
+        assert statuses.count(401) <= 5
+        assert set(statuses) <= {401, 429, 503}
+
+
+@pytest.mark.real_time
+async def test_stop_needs_a_session_a_role_and_this_page(tmp_path: Path) -> None:
+    async with serving(tmp_path) as (run, url), Viewer(url) as anna, Viewer(url) as bob:
+        assert (await anna.client.post(ROUTES.stop)).status_code == 401
+        assert await anna.log_in("anna", PASSWORD) == 303
+        assert await bob.log_in("bob", PASSWORD) == 303
+        assert (await bob.client.post(ROUTES.stop)).status_code == 403
+        foreign = {"origin": "http://evil.example"}
+        assert (await anna.client.post(ROUTES.stop, headers=foreign)).status_code == 403
+        assert (await anna.client.post("stop?hold=none")).status_code == 404
+        assert (await anna.client.get(ROUTES.stop)).status_code in (404, 405)
+        assert run.asked == []
+        answer = await anna.client.post(ROUTES.stop)
+        assert (answer.status_code, answer.text) == (200, "stop: done\n")
+        assert [(command.kind, command.why) for command in run.asked] == [("stop", "web: anna")]
