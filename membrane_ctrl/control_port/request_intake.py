@@ -66,9 +66,7 @@ class RequestIntake:
         Common to all connections of the port.
     """
 
-    def __init__(
-        self, wire: Wire, answer: AnswerRequest, record_refusal: RecordRefusal, turns: ReadingTurns
-    ) -> None:
+    def __init__(self, wire: Wire, answer: AnswerRequest, record_refusal: RecordRefusal, turns: ReadingTurns) -> None:
         self._wire = wire
         self._answer = answer
         self._record_refusal = record_refusal

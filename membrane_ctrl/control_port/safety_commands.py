@@ -1,4 +1,4 @@
-"""The commands that make the mirror safe: they overtake all others on every interface, and none of them is dropped."""
+"""The commands that make the mirror safe: they overtake all others on every interface, and none is dropped."""
 
 from __future__ import annotations
 
