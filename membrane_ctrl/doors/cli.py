@@ -73,6 +73,7 @@ async def _serve(door: Door) -> None:
     except* asyncio.CancelledError:
         print("doors: closed", file=sys.stderr)
     finally:
+        await door.close()
         await asyncio.to_thread(door.feed.close)
     if wrong is not None:
         raise _first_error(wrong)

@@ -36,7 +36,7 @@ Message = dict[str, Any]
 SendCommand = Callable[[Message, SendLimits], str]
 ReportLate = Callable[[str], None]
 
-_MOVES_NOTHING = frozenset({"mark", "quiet"})
+MOVES_NOTHING = frozenset({"mark", "quiet"})
 
 
 @dataclass(slots=True, eq=False)
@@ -94,6 +94,15 @@ class CommandLanes:
             self._submit_ordinary(request, outcome)
         return outcome
 
+    async def close(self) -> None:
+        """End; safety commands under way have until their answer is due."""
+        if self._safety_task is not None:
+            await asyncio.wait({self._safety_task}, timeout=SAFETY_ANSWER_S)
+        tasks = [task for task in (self._safety_task, self._ordinary_task) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
     def _submit_ordinary(self, request: Message, outcome: asyncio.Future[str]) -> None:
         if len(self._ordinary) >= ORDINARY_MOST:
             outcome.set_result(f"{request['do']} refused: too many commands at once: {ORDINARY_MOST} wait already")
@@ -129,8 +138,8 @@ class CommandLanes:
         self._newest_safety = winner
         self._safety_count += 1
         for waiting in self._ordinary:
-            if waiting.kind not in _MOVES_NOTHING:
-                waiting.answer(f"{waiting.kind} refused: {_overtaken(winner)}")
+            if waiting.kind not in MOVES_NOTHING:
+                waiting.answer(f"{waiting.kind} refused: {overtaken(winner)}")
 
     async def _serve_ordinary(self) -> None:
         while self._ordinary:
@@ -145,9 +154,9 @@ class CommandLanes:
         count = self._safety_count
 
         def refusal() -> str:
-            if kind in _MOVES_NOTHING or self._safety_count == count:
+            if kind in MOVES_NOTHING or self._safety_count == count:
                 return ""
-            return _overtaken(self._newest_safety)
+            return overtaken(self._newest_safety)
 
         return refusal
 
@@ -184,7 +193,8 @@ def _answer_provisionally(outcome: asyncio.Future[str], kind: str) -> None:
         outcome.set_result(f"{kind}: no answer from the hold within {SAFETY_ANSWER_S:g} s; still being sent")
 
 
-def _overtaken(winner: str) -> str:
+def overtaken(winner: str) -> str:
+    """Why a command is refused that came before the safety command `winner`, and would undo it."""
     return f"{winner} came meanwhile and takes precedence; send again"
 
 

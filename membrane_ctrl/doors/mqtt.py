@@ -1,7 +1,7 @@
 """The door to MQTT: one JSON object of all values, a retained availability, commands, Home Assistant's discovery.
 
 Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`; retained, also the last will),
-`do/<command>`, `answer`, `owner` (`mqtt_owner`).
+`do/<command>`, `answer`, `owner` (`mqtt_owner`), `order` (`mqtt_barrier`).
 
 There are two connections. The first one has the safety commands and the claim to the name. A broker queues messages
 for each connection apart and drops what a slow one does not take, so no flood of other commands can drop a `latch`.
@@ -25,6 +25,8 @@ from paho.mqtt.properties import Properties
 
 from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
+from membrane_ctrl.doors.command_lanes import MOVES_NOTHING, overtaken
+from membrane_ctrl.doors.mqtt_barrier import OrderBarrier
 from membrane_ctrl.doors.mqtt_inbox import HandleMessage, Inbox, Reports
 from membrane_ctrl.doors.mqtt_owner import NameOwnership, OwnerClaim
 from membrane_ctrl.doors.names import TABLE, Door, Published
@@ -153,24 +155,32 @@ async def _serve_connection(broker: Broker, config: MqttConfig, door: Door, owne
     def handle(message: aiomqtt.Message) -> None:
         if str(message.topic) == owner_topic:
             ownership.receive(_payload(message), message.retain)
-        else:
-            _obey(message, door, safety_reports)
+            return
+        if not message.retain:
+            barrier.raise_for(_command_name(message))
+        _obey(message, door, safety_reports)
 
+    async def publish_marker(marker: str) -> None:
+        await guard.publish(f"{base}/order", marker, qos=1)
+
+    barrier = OrderBarrier(broker.claim.instance)
     safety_reports = Reports(publish_safety_answer, 0.0)
     ownership.forget_heard()
     async with broker.client("safety", handle) as guard, asyncio.TaskGroup() as tasks:
-        watching = [tasks.create_task(_wait_for_disconnect(guard))]
+        watching = tasks.create_task(_wait_for_disconnect(guard))
         await guard.subscribe(owner_topic, qos=1)
         await ownership.establish(publish_claim)
-        watching.append(tasks.create_task(ownership.keep(publish_claim)))
-        watching.append(tasks.create_task(safety_reports.run()))
+        keeping = tasks.create_task(ownership.keep(publish_claim))
+        others = (tasks.create_task(safety_reports.run()), tasks.create_task(barrier.run(publish_marker)))
         await guard.subscribe([(f"{base}/do/{name}", 1) for name in sorted(SAFETY)])
         door.late_listeners.append(safety_reports.add)
         try:
-            await _publish_and_obey(broker, config, door)
+            await _publish_and_obey(broker, config, door, barrier)
         except asyncio.CancelledError:
             # The program ends, unless it was another task that failed: the name is free for the next bridge.
-            if not any(task.done() for task in watching):
+            failed = any(task.done() for task in (watching, keeping, *others))
+            keeping.cancel()
+            if not failed:
                 with suppress(aiomqtt.MqttError, TimeoutError):
                     async with asyncio.timeout(_LEAVES_S):
                         await publish_claim(b"", True)
@@ -185,7 +195,7 @@ async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
         pass
 
 
-async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door) -> None:
+async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door, barrier: OrderBarrier) -> None:
     """Publish the values, and obey the commands that are no safety commands, on a connection of their own."""
     base = broker.base
 
@@ -193,10 +203,16 @@ async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door) -> N
         await client.publish(f"{base}/answer", answer, qos=1)
 
     def handle(message: aiomqtt.Message) -> None:
-        topic = str(message.topic)
+        topic, name = str(message.topic), _command_name(message)
         if topic == f"{base}/availability":
             availability.receive(_payload(message))
-        elif not is_safety_command(topic.rpartition("/")[2]):  # those come on the other connection
+        elif topic == f"{base}/order":
+            barrier.receive(_payload(message))
+        elif is_safety_command(name):
+            return  # it also comes on the other connection
+        elif barrier.newest and name not in MOVES_NOTHING:
+            reports.add_refusal(f"{name} refused: {overtaken(barrier.newest)}")
+        else:
             _obey(message, door, reports)
 
     availability = Availability()
@@ -204,7 +220,7 @@ async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door) -> N
     will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
     async with broker.client("values", handle, will) as client:
         print(f"mqtt: connected to {broker.where}", file=sys.stderr, flush=True)
-        await client.subscribe([(f"{base}/do/+", 1), (f"{base}/availability", 1)])
+        await client.subscribe([(f"{base}/{topic}", 1) for topic in ("do/+", "availability", "order")])
         if config.discovery_prefix:
             topic = f"{config.discovery_prefix}/device/membrane_{door.settings.name}/config"
             await client.publish(topic, json.dumps(discovery(door, base)), qos=1, retain=True)
@@ -264,15 +280,19 @@ async def _publish(client: aiomqtt.Client, door: Door, base: str, availability: 
 
 def _obey(message: aiomqtt.Message, door: Door, reports: Reports) -> None:
     """Hand a command on, or refuse it; the answer is reported in either case."""
-    name = str(message.topic).rpartition("/")[2]
+    name = _command_name(message)
     if message.retain:  # an old command, delivered again at each connection
-        reports.add(f"{name} refused: a retained message is no command")
+        reports.add_refusal(f"{name} refused: a retained message is no command")
         return
     outcome = door.submit("mqtt", name, _payload(message))
     if outcome.done():
-        reports.add(outcome.result())
+        reports.add_refusal(outcome.result())
     else:
         outcome.add_done_callback(lambda done: reports.add(done.result()))
+
+
+def _command_name(message: aiomqtt.Message) -> str:
+    return str(message.topic).rpartition("/")[2]
 
 
 def _payload(message: aiomqtt.Message) -> bytes:

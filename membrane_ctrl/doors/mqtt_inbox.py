@@ -26,7 +26,7 @@ class Inbox(asyncio.Queue[aiomqtt.Message]):
 
 
 class Reports:
-    """Answers to commands, published in order. Of a flood, those for which there is no room are counted.
+    """Answers to commands, published in order. Of a flood of refusals, those for which there is no room are counted.
 
     Parameters
     ----------
@@ -44,12 +44,16 @@ class Reports:
         self._added = asyncio.Event()
 
     def add(self, answer: str) -> None:
-        """Publish an answer soon."""
+        """Publish an answer soon; those of commands that were sent to the hold are few."""
+        self._waiting.append(answer)
+        self._added.set()
+
+    def add_refusal(self, answer: str) -> None:
+        """Publish the refusal of a command that was not sent, or count it."""
         if len(self._waiting) < _REPORTS_MOST:
-            self._waiting.append(answer)
+            self.add(answer)
         else:
             self._uncounted += 1
-        self._added.set()
 
     async def run(self) -> None:
         """Publish until cancelled."""
@@ -59,7 +63,7 @@ class Reports:
                 await self._publish(self._waiting.popleft())
             elif self._uncounted:
                 count, self._uncounted = self._uncounted, 0
-                await self._publish(f"{count} more commands were answered in the same way: too many at once")
+                await self._publish(f"{count} more commands were refused: too many at once")
             else:
                 self._added.clear()
             await asyncio.sleep(self._pause_s)

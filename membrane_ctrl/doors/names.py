@@ -181,6 +181,10 @@ class Door:
             outcome.add_done_callback(note)
         return answer
 
+    async def close(self) -> None:
+        """End what is under way."""
+        await self._lanes.close()
+
     def _noted(self, by: str, name: str, outcome: str) -> str:
         """Note an outcome as the value `answer`; refusals of a flood do not replace a safety command's answer."""
         answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome}"

@@ -73,6 +73,7 @@ async def bridge(folder: Path, role: str = "operate", **settings: object) -> Asy
         finally:
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
+            await door.close()
 
 
 def client_of(url: str, name: str = "", password: str = "") -> Client:
@@ -174,16 +175,18 @@ async def test_the_configured_role_limits_a_user(tmp_path: Path, users_file: str
 
 
 async def test_guesses_delay_neither_a_stop_nor_the_owner(tmp_path: Path, users_file: str) -> None:
-    async with bridge(tmp_path, users_file=users_file) as (_, url):
-        async with client_of(url, "anna", PASSWORDS["anna"]) as operator:  # noqa: SIM117
-            mirror, space = await mirror_of(operator)
-            guesses = [asyncio.create_task(refusal_of(client_of(url, "anna", f"guess {n}"))) for n in range(40)]
-            await asyncio.sleep(0.2)
-            begin_s = time.monotonic()
-            assert (await mirror.call_method(f"{space}:stop")).endswith("stop: done")
-            assert time.monotonic() - begin_s < ANSWER_S
-            assert await refusal_of(client_of(url, "anna", PASSWORDS["anna"])) == "", "the owner logs in again"
-            assert set(await asyncio.gather(*guesses)) == {"BadUserAccessDenied"}
+    async with (
+        bridge(tmp_path, users_file=users_file) as (_, url),
+        client_of(url, "anna", PASSWORDS["anna"]) as operator,
+    ):
+        mirror, space = await mirror_of(operator)
+        guesses = [asyncio.create_task(refusal_of(client_of(url, "anna", f"guess {n}"))) for n in range(40)]
+        await asyncio.sleep(0.2)
+        begin_s = time.monotonic()
+        assert (await mirror.call_method(f"{space}:stop")).endswith("stop: done")
+        assert time.monotonic() - begin_s < ANSWER_S
+        assert await refusal_of(client_of(url, "anna", PASSWORDS["anna"])) == "", "the owner logs in again"
+        assert set(await asyncio.gather(*guesses)) == {"BadUserAccessDenied"}
 
 
 async def test_encrypted_sessions_only_with_a_certificate(tmp_path: Path, users_file: str) -> None:
