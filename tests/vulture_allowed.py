@@ -4,7 +4,9 @@ _.connection_made, _.connection_lost, _.data_received, exc  # asyncio calls thes
 _.process_renderables, _.writelines  # Rich and `print` call these of a console and a stream
 _.model_config, _.nullable_schema, _.field_title_should_be_set  # pydantic
 _.num_tickets  # ssl
-_.get_user  # asyncua calls it
+_.get_user, _._make_protocol  # asyncua calls these
+_.method_service, _.max_connections, _.max_pending_messages_per_connection, _.max_message_size  # asyncua reads these
+_.put_nowait, maxsize, _.MaximumPacketSize  # aiomqtt and paho use these
 acquisition_main, alarms_main, console_main, recorder_main  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`

@@ -53,6 +53,9 @@ def configured(path: Path | None) -> "Config":
     doors = config.doors
     if doors.mqtt is not None:
         doors = doors.model_copy(update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")})
+    if doors.opcua is not None:
+        opcua = _beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
+        doors = doors.model_copy(update={"opcua": opcua})
     web = config.web and _beside(config.web, folder, "users_file", "certificate_file", "key_file")
     update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors, "web": web}
     return config.model_copy(update=update)

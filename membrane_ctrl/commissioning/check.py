@@ -20,6 +20,7 @@ from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
 from membrane_ctrl.acquisition import optical_bench, session
 from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.commissioning import interlock_check
+from membrane_ctrl.config.bridge_access import describe_bridges
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
@@ -166,6 +167,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "locks": _locks(config),
         "control port": _port(config.port),
         "alarms": _alarms(config.alarms),
+        "bridges": describe_bridges(config.doors),
     }
 
 

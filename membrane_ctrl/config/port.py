@@ -178,6 +178,25 @@ class OpcuaConfig(Section):
     """Address to listen on. Change it to let other machines connect."""
     port: Annotated[int, Field(ge=1, le=65535)] = 4840
     """TCP port. Change it if another program has it."""
+    users_file: str | None = None
+    """Users and passwords, made with `membrane-ctrl web add-user`. Set it so that only they may read and act."""
+    certificate_file: str | None = None
+    """Certificate of this server (RSA, PEM); with it all sessions are encrypted. Set it with `key_file`."""
+    key_file: str | None = None
+    """Private key of the certificate. Set it with `certificate_file`."""
+
+    @property
+    def encrypted(self) -> bool:
+        """Whether sessions are encrypted."""
+        return self.certificate_file is not None and self.key_file is not None
+
+    @model_validator(mode="after")
+    def _certificate_with_key(self) -> "OpcuaConfig":
+        if (self.certificate_file is None) != (self.key_file is None):
+            raise ValueError("certificate and key: give both files, or none")
+        if self.host not in LOCAL_HOSTS and self.users_file is not None and not self.encrypted:
+            raise ValueError(f"host {self.host}: passwords would cross the network in plain text; give a certificate")
+        return self
 
 
 class EpicsConfig(Section):
@@ -207,10 +226,12 @@ class DoorsConfig(Section):
     @model_validator(mode="after")
     def _only_people_we_know_act(self) -> "DoorsConfig":
         for name, door in (("opcua", self.opcua), ("epics", self.epics)):
-            if door is not None and door.host not in LOCAL_HOSTS and self.role != "read":
+            known = isinstance(door, OpcuaConfig) and door.users_file is not None
+            if door is not None and door.host not in LOCAL_HOSTS and self.role != "read" and not known:
+                remedy = "give users_file, or keep" if name == "opcua" else "keep"
                 raise ValueError(
                     f"{name}.host = {door.host!r}: this door cannot tell who acts from another machine; "
-                    f"keep role = 'read', or the host {LOCAL}"
+                    f"{remedy} role = 'read', or the host {LOCAL}"
                 )
         return self
 

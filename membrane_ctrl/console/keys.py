@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.model import errors, terminal
 
 _LINE_MODES, _CONTROL_CHARACTERS = 3, 6  # of what `termios.tcgetattr` returns
@@ -91,9 +92,17 @@ Send = Callable[[Request], "Future[str]"]
 
 
 def sender(socket: Path, run: str) -> Send:
-    """Return a function that sends requests to a run one after the other, without waiting for the answer."""
-    worker = ThreadPoolExecutor(1)
-    return lambda request: worker.submit(ask, socket, run, request)
+    """Return a function that sends requests to a run without waiting for the answer.
+
+    They are sent one after the other, but safety commands do not wait for the others.
+    """
+    worker, safety_worker = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+
+    def send(request: Request) -> Future[str]:
+        chosen = safety_worker if is_safety_command(request["do"]) else worker
+        return chosen.submit(ask, socket, run, request)
+
+    return send
 
 
 def ask(socket: Path, run: str, request: Request) -> str:

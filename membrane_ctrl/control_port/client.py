@@ -7,6 +7,7 @@ import json
 import socket
 import ssl
 import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ class PortClient:
         self._number = 0
         try:
             greeting = self._next()
+            self._greeted_s = time.monotonic()
         except DeviceError:
             self.close()
             raise
@@ -84,13 +86,23 @@ class PortClient:
         """Send a request (`protocol.Request`) and wait for its answer. Raises DeviceError if none comes."""
         self._number += 1
         try:
-            self._connection.sendall(protocol.encode({**request, "number": self._number}))
+            self._connection.sendall(protocol.encode({**self._expiry(), **request, "number": self._number}))
         except OSError as error:
             raise DeviceError(f"{self._where}: {os_reason(error)}") from None
         for message in self.messages():
             if message.get("number") in (self._number, 0):  # 0: the hold could not read the request's number
                 return message
         raise DeviceError(f"{self._where}: the hold closed the connection without an answer")
+
+    def _expiry(self) -> Message:
+        """The time after which nobody waits for the answer, on the hold's clock; none if the hold sends no clock.
+
+        A hold that hangs for longer must not obey the request afterwards.
+        """
+        now_s = self.greeting.get("now_s")
+        if not isinstance(now_s, int | float):
+            return {}
+        return {"expires_s": now_s + time.monotonic() - self._greeted_s + _ANSWER_S}
 
     def messages(self) -> Iterator[Message]:
         """Yield messages until the hold ends; pass on notices."""

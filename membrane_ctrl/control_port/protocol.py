@@ -1,18 +1,16 @@
 """One JSON object per line in either direction, and limits so that no message costs a tick.
 
 A request carries a number; its answer carries the same. Messages without a number are unsolicited: the greeting,
-notices, and the stream of `watch`. `PortSession` is one client from greeting to goodbye.
+notices, and the stream of `watch`. `session.PortSession` is one client from greeting to goodbye.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 import socket
 import ssl
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -20,8 +18,8 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
+from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.controller.commands import SAME_AS, TABLE, Kind, Role
-from membrane_ctrl.model.events import Event
 
 VERSION = 1
 
@@ -89,6 +87,8 @@ class Request(Section):
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
     on_behalf: OnBehalf | None = None  # None: the peer of the connection itself
+    # time limit on the clock of the greeting's `now_s`; later the request is refused, unless it is a safety command
+    expires_s: float | None = None
 
     @field_validator("do", mode="before")
     @classmethod
@@ -138,6 +138,7 @@ def _short(reason: str, most: int = 300) -> str:
 
 
 _LINE_S = 5.0  # to complete a line
+_CHUNK_BYTES = 4096  # read at once: at most a few hundred short lines, 0.3 ms
 # A reader this far behind is dropped: a 10 Hz watcher after a minute
 _UNREAD_BYTES = 1 << 20
 _HANDSHAKE_S = 3.0
@@ -152,6 +153,7 @@ class Wire:
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
+        self._part = b""  # of a line that is not complete yet
 
     @classmethod
     async def on(cls, connection: socket.socket, context: ssl.SSLContext | None = None) -> Wire:
@@ -169,22 +171,39 @@ class Wire:
         found: dict[str, Any] | None = self._writer.get_extra_info("peercert")
         return found or {}
 
-    async def line(self) -> bytes | None:
-        """The next line; None when the peer has gone. Raises RequestError if it is too long or too slow."""
-        try:
-            first = await self._reader.read(1)  # a peer may be silent for hours between lines
-            if first in (b"", b"\n"):
-                return first or None
-            # not `wait_for`, which loses a cancellation that coincides with its result
-            async with asyncio.timeout(_LINE_S):
-                rest = await self._reader.readuntil(b"\n")
-        except asyncio.LimitOverrunError:
-            raise RequestError(f"a message may have at most {MESSAGE_BYTES} bytes") from None
-        except TimeoutError:
-            raise RequestError(f"a message must be complete within {_LINE_S:g} s") from None
-        except (asyncio.IncompleteReadError, OSError):
-            return None
-        return first + rest
+    async def lines(self) -> list[bytes] | None:
+        """The complete lines that have arrived, at least one; None when the peer has gone.
+
+        Raises RequestError if a line is too long or too slow.
+        """
+        begun_s: float | None = None
+        while True:
+            # A peer may be silent for hours between lines, but not within one.
+            now_s = asyncio.get_running_loop().time()
+            if self._part and begun_s is None:
+                begun_s = now_s
+            left_s = None if begun_s is None else begun_s + _LINE_S - now_s
+            try:
+                # not `wait_for`, which loses a cancellation that coincides with its result
+                async with asyncio.timeout(left_s):
+                    chunk = await self._reader.read(_CHUNK_BYTES)
+            except TimeoutError:
+                raise RequestError(f"a message must be complete within {_LINE_S:g} s") from None
+            except OSError:
+                return None
+            if not chunk:
+                return None
+            *complete, self._part = (self._part + chunk).split(b"\n")
+            longest = max(map(len, (*complete, self._part)))
+            if longest >= MESSAGE_BYTES:
+                raise RequestError(f"a message may have at most {MESSAGE_BYTES} bytes")
+            if complete:
+                return complete
+
+    @property
+    def unread_bytes(self) -> int:
+        """What was sent and not yet taken by the peer's system."""
+        return self._writer.transport.get_write_buffer_size()
 
     def send(self, message: dict[str, Any]) -> None:
         """Send without waiting. Raises SlowReaderError (and ends the connection) if too much is unread."""
@@ -221,8 +240,8 @@ class Wire:
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
 
-# These need no command: stopping the pump is always accepted, and the others move nothing
-FREE = frozenset({"status", "watch", "stop", "latch", "unlock", "mark", "release", "quiet"})
+# These need no command: what makes the mirror safe is always accepted, and the others move nothing
+FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SAFETY
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,83 +322,3 @@ class Commander:
         """Release command, if `who` has it."""
         if self._holder == who:
             self._holder = ""
-
-
-# A client that sends faster is read more slowly: all requests together cost less than a tick in fifty
-_PAUSE_S = 0.1
-# A program that sends this many invalid requests in a row will not stop
-_NONSENSE_MOST = 10
-
-Answer = Callable[["PortSession", Request], Awaitable[dict[str, Any]]]
-Refused = Callable[[str, str, str], None]
-
-
-class PortSession:
-    """A connection whose peer is known; `watch` streams `status`."""
-
-    def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]]) -> None:
-        self.peer = peer
-        self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
-        self._wire = wire
-        self._status = status
-        self._watch: asyncio.Task[None] | None = None
-
-    async def run(self, greeting: dict[str, Any], answer: Answer, refused: Refused) -> None:
-        """Answer requests until the peer disconnects."""
-        try:
-            self._wire.send(greeting)
-            await self._converse(answer, refused)
-        except SlowReaderError as error:
-            refused(self.peer.who, "", str(error))
-        except RequestError as error:
-            refused(self.peer.who, "", str(error))
-            with contextlib.suppress(SlowReaderError):
-                self._wire.send({"number": 0, "ok": False, "refused": str(error)})
-        finally:
-            self.watch(None)
-            await self._wire.close()
-
-    async def _converse(self, answer: Answer, refused: Refused) -> None:
-        nonsense = 0
-        while (line := await self._wire.line()) is not None:
-            self.heard_s = asyncio.get_running_loop().time()
-            try:
-                request = parse(line)
-            except RequestError as error:
-                nonsense += 1
-                if nonsense > _NONSENSE_MOST:
-                    raise
-                refused(self.peer.who, "", str(error))
-                self._wire.send({"number": error.number, "ok": False, "refused": str(error)})
-            else:
-                nonsense = 0
-                self._wire.send({"number": request.number, **await answer(self, request)})
-            await asyncio.sleep(_PAUSE_S)
-
-    def notice(self, text: str) -> None:
-        """Send an unsolicited notice."""
-        with contextlib.suppress(SlowReaderError):
-            self._wire.send({"notice": text})
-
-    def event(self, event: Event) -> None:
-        """Send an event to a watching peer."""
-        if self._watch is not None:
-            with contextlib.suppress(SlowReaderError):
-                self._wire.send({"event": event.to_dict()})
-
-    def watch(self, period_s: float | None) -> None:
-        """Stream the status from now on; None ends it."""
-        if self._watch is not None:
-            self._watch.cancel()
-        self._watch = None if period_s is None else asyncio.create_task(self._stream(period_s), name="port watch")
-
-    async def _stream(self, period_s: float) -> None:
-        with contextlib.suppress(SlowReaderError):
-            while True:
-                await asyncio.sleep(period_s)
-                self._wire.send({"status": self._status()})
-
-    def drop(self, why: str) -> None:
-        """End the connection with a last message."""
-        self.notice(why)
-        self._wire.abort()

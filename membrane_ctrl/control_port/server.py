@@ -19,7 +19,10 @@ from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
-from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, PortSession, Sender, may_not
+from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, Sender, may_not
+from membrane_ctrl.control_port.request_intake import ReadingTurns
+from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.control_port.session import PortSession
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.instruments.lock_store import draw_word
 from membrane_ctrl.model import errors, events, run_events, telemetry
@@ -59,6 +62,7 @@ class Port:
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._changed: dict[int, dict[str, str]] = {}  # by number of the request: the lock that it set or removed
         self._sessions: list[PortSession] = []
+        self._turns = ReadingTurns()
         self._over = False
 
     def heard(self, outputs: tick.TickOutputs) -> None:
@@ -147,7 +151,7 @@ class Port:
 
     async def _serve(self, wire: protocol.Wire, peer: Peer, lasts_s: float | None = None) -> None:
         self._make_room(peer)
-        session = PortSession(wire, peer, self.status)
+        session = PortSession(wire, peer, self.status, self._turns)
         self._sessions.append(session)
         loop = asyncio.get_running_loop()
         expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
@@ -157,6 +161,7 @@ class Port:
             "you": peer.who,
             "role": peer.role,
             "commander": self._commander.holder(self._now()) or None,
+            "now_s": self._now(),
         }
         try:
             await session.run(greeting, self._answer, self._refusals.record)
@@ -179,7 +184,10 @@ class Port:
         """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
         sender = protocol.sender_of(peer, request.on_behalf)
-        refusal = may_not(sender, request.do) or self._claim_command(peer, request)
+        refusal = may_not(sender, request.do) or self._expired(request) or self._claim_command(peer, request)
+        if not refusal and is_safety_command(request.do):
+            for other in self._sessions:
+                other.refuse_waiting(request.do)
         if not refusal and request.do not in commands.TABLE:
             return self._run_errand(session, sender, request)
         try:
@@ -210,6 +218,12 @@ class Port:
         except TimeoutError:
             problem = f"the disk has not confirmed it within {_STORE_S:g} s"
         return found | {"stored": not problem, "problem": problem}
+
+    def _expired(self, request: protocol.Request) -> str:
+        """Why the request is too old to be obeyed; empty if it is not. Safety commands never are."""
+        if request.expires_s is None or is_safety_command(request.do) or self._now() <= request.expires_s:
+            return ""
+        return f"{request.do} came {self._now() - request.expires_s:.1f} s after its time limit; send again"
 
     def _claim_command(self, peer: Peer, request: protocol.Request) -> str:
         if request.do in FREE:

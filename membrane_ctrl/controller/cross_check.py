@@ -17,7 +17,13 @@ from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control import gas
-from membrane_ctrl.controller import cross_check_interlocks, cross_check_plant, pump_obeys, safety
+from membrane_ctrl.controller import (
+    cross_check_bridges,
+    cross_check_interlocks,
+    cross_check_plant,
+    pump_obeys,
+    safety,
+)
 from membrane_ctrl.model.errors import FindingsError
 
 _RESUMES_MOST = 24  # a day: the cause of a fault that recurs more than once an hour is not temporary
@@ -255,4 +261,5 @@ _RULES = (
     cross_check_plant.judge_loop,
     cross_check_plant.judge_shape,
     cross_check_plant.judge_optics,
+    cross_check_bridges.judge_bridges,
 )

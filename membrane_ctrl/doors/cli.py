@@ -73,9 +73,16 @@ async def _serve(door: Door) -> None:
     except* asyncio.CancelledError:
         print("doors: closed", file=sys.stderr)
     finally:
+        await door.close()
         await asyncio.to_thread(door.feed.close)
     if wrong is not None:
-        raise next(each for each in wrong.exceptions if isinstance(each, errors.CommandError))
+        raise _first_error(wrong)
+
+
+def _first_error(group: BaseExceptionGroup[errors.CommandError]) -> errors.CommandError:
+    """The first error of a group, also of groups in it."""
+    first = group.exceptions[0]
+    return _first_error(first) if isinstance(first, BaseExceptionGroup) else first
 
 
 def _opened(door: Door) -> list[Any]:

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.port import EpicsConfig
+from membrane_ctrl.doors.epics_search import require_unserved
 from membrane_ctrl.doors.names import TABLE, Door, Value
+from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Action
 
@@ -25,8 +27,14 @@ _DIGITS = 4
 
 
 async def serve(config: EpicsConfig, door: Door) -> None:
-    """Serve until cancelled. Raises DeviceError if the address is taken."""
+    """Serve until cancelled. Raises DeviceError if the address is taken, or another server has these records."""
+    with bench.locked([f"EPICS records {door.settings.name}:*"]):
+        await _serve_records(config, door)
+
+
+async def _serve_records(config: EpicsConfig, door: Door) -> None:
     async with door.opening:
+        await asyncio.to_thread(require_unserved, f"{door.settings.name}:state", config.ca_port)
         records = _opened(config, door)
     print(f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}", file=sys.stderr, flush=True)
     from softioc import alarm

@@ -1,61 +1,130 @@
 """The door to MQTT: one JSON object of all values, a retained availability, commands, Home Assistant's discovery.
 
 Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`; retained, also the last will),
-`do/<command>`, `answer`.
+`do/<command>`, `answer`, `owner` (`mqtt_owner`), `order` (`mqtt_barrier`).
+
+There are two connections. The first one has the safety commands and the claim to the name. A broker queues messages
+for each connection apart and drops what a slow one does not take, so no flood of other commands can drop a `latch`.
+The second one publishes the values and has all other commands; only its will says that the bridge has gone.
 """
 
 import asyncio
 import json
 import ssl
 import sys
+import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import aiomqtt
+from aiomqtt.exceptions import MqttConnectError
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
 
 from membrane_ctrl.config.port import MqttConfig
+from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
+from membrane_ctrl.doors.command_lanes import MOVES_NOTHING, overtaken
+from membrane_ctrl.doors.mqtt_barrier import OrderBarrier
+from membrane_ctrl.doors.mqtt_inbox import HandleMessage, Inbox, Reports
+from membrane_ctrl.doors.mqtt_owner import NameOwnership, OwnerClaim
 from membrane_ctrl.doors.names import TABLE, Door, Published
 from membrane_ctrl.model import errors, files
 
 _LEAVES_S = 2.0
 _AGAIN_S = 1.0  # a returned broker has values within two seconds, however long it was away
-_QUEUED_MOST = 32  # commands that wait; aiomqtt drops what a flood brings beyond
+_STEADY_S = 10.0  # a connection that lasted so long worked: the next failure is a new one, and is printed
 _KEEPALIVE_S = 10  # the broker notices a cut line after one and a half of these
+_PACKET_BYTES_MAX = 1 << 20  # a broker of MQTT 5 delivers no larger message
+_LOOK_S = 0.5  # how often the availability is compared with the hold
+_REPORT_PAUSE_S = 0.02
 _STATE_LETTERS = 255  # the longest state that Home Assistant takes
 _CLASSES = {"Pa": "pressure", "°C": "temperature"}  # of Home Assistant; it knows no micrometres
+_UNSUPPORTED_VERSION = (1, 132)  # reason codes of MQTT 3.1.1 and 5
 
 
 async def serve(config: MqttConfig, door: Door) -> None:
-    """Publish until cancelled; connect again whenever the broker returns. Raises InputError for a wrong file."""
-    base = f"membrane/{door.settings.name}"
-    password = _read(config.password_file)
-    context = _context(config)
-    will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
-    told, where = False, f"{config.host}:{config.port}"
+    """Publish until cancelled; connect again whenever the broker returns.
+
+    Raises InputError for a wrong file, DeviceError if another bridge has the name at this broker.
+    """
+    broker = Broker(config, door.settings.name)
+    ownership = NameOwnership(broker.claim, f"{broker.where}: the name {door.settings.name!r}")
+    printed = False
     async with door.opening:
         pass  # a connection would time out meanwhile
     while True:
+        began_s = time.monotonic()
         try:
-            async with aiomqtt.Client(
-                config.host,
-                config.port,
-                username=config.username,
-                password=password,
-                will=will,
-                tls_context=context,
-                keepalive=_KEEPALIVE_S,
-                max_queued_incoming_messages=_QUEUED_MOST,
-            ) as client:
-                told = False
-                print(f"mqtt: connected to {where}", file=sys.stderr, flush=True)
-                await _converse(client, config, door, base)
+            await _serve_connection(broker, config, door, ownership)
         except* (aiomqtt.MqttError, OSError) as group:
-            if not told:
-                reason = "; ".join(str(error) for error in group.exceptions)
-                print(f"mqtt: {where}: {reason}; trying again", file=sys.stderr, flush=True)
-            told = True
+            reasons = _leaves(group)
+            broker.note_failure(reasons)
+            printed = printed and time.monotonic() - began_s < _STEADY_S
+            if not printed:
+                reason = "; ".join(dict.fromkeys(map(str, reasons)))
+                print(f"mqtt: {broker.where}: {reason}; trying again", file=sys.stderr, flush=True)
+            printed = True
         await asyncio.sleep(_AGAIN_S)
+
+
+def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
+    """The exceptions of a group and of the groups in it."""
+    found: list[BaseException] = []
+    for error in group.exceptions:
+        found += _leaves(error) if isinstance(error, BaseExceptionGroup) else [error]
+    return found
+
+
+class Broker:
+    """How to connect to the configured broker. Raises InputError for a wrong file."""
+
+    def __init__(self, config: MqttConfig, name: str) -> None:
+        self._config = config
+        self._name = name
+        self._password = _read(config.password_file)
+        self._context = _context(config)
+        self._version = aiomqtt.ProtocolVersion.V5
+        self.claim = OwnerClaim.of_this_process()
+        self.where = f"{config.host}:{config.port}"
+        self.base = f"membrane/{name}"
+
+    def client(self, purpose: str, handle: HandleMessage, will: aiomqtt.Will | None = None) -> aiomqtt.Client:
+        """A connection for a purpose, a context manager.
+
+        Its identifier stays the same for this process: at a reconnection the broker ends the former connection.
+        """
+        inbox = Inbox(handle)
+
+        def make_queue(maxsize: int) -> Inbox:
+            return inbox
+
+        properties = None
+        if self._version is aiomqtt.ProtocolVersion.V5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.MaximumPacketSize = _PACKET_BYTES_MAX
+        return aiomqtt.Client(
+            self._config.host,
+            self._config.port,
+            username=self._config.username,
+            password=self._password,
+            identifier=f"membrane-{self._name}-{self.claim.instance[:8]}-{purpose}",
+            protocol=self._version,
+            properties=properties,
+            will=will,
+            tls_context=self._context,
+            keepalive=_KEEPALIVE_S,
+            queue_type=cast(type[Inbox], make_queue),
+        )
+
+    def note_failure(self, reasons: list[BaseException]) -> None:
+        """Use MQTT 3.1.1 from now on if the broker refuses version 5."""
+        for error in reasons:
+            if isinstance(error, MqttConnectError):
+                code = error.rc if isinstance(error.rc, int) or error.rc is None else error.rc.value
+                if code in _UNSUPPORTED_VERSION:
+                    self._version = aiomqtt.ProtocolVersion.V311
 
 
 def _read(file: str | None) -> str | None:
@@ -72,43 +141,162 @@ def _context(config: MqttConfig) -> ssl.SSLContext | None:
         raise errors.InputError(f"doors.mqtt.ca_file: {config.ca_file}: {error}") from None
 
 
-async def _converse(client: aiomqtt.Client, config: MqttConfig, door: Door, base: str) -> None:
-    await client.subscribe(f"{base}/do/+", qos=1)
-    if config.discovery_prefix:
-        topic = f"{config.discovery_prefix}/device/membrane_{door.settings.name}/config"
-        await client.publish(topic, json.dumps(discovery(door, base)), qos=1, retain=True)
-    try:
-        async with asyncio.TaskGroup() as both:
-            both.create_task(_publish(client, door, base))
-            both.create_task(_obey(client, door, base))
-    except asyncio.CancelledError:  # a clean goodbye suppresses the last will
-        async with asyncio.timeout(_LEAVES_S):
-            await client.publish(f"{base}/availability", "offline", qos=1, retain=True)
-        raise
+async def _serve_connection(broker: Broker, config: MqttConfig, door: Door, ownership: NameOwnership) -> None:
+    """Connect, claim the name, publish and obey until a connection fails."""
+    base = broker.base
+    owner_topic = f"{base}/owner"
+
+    async def publish_claim(payload: bytes, retained: bool) -> None:
+        await guard.publish(owner_topic, payload, qos=1, retain=retained)
+
+    async def publish_safety_answer(answer: str) -> None:
+        await guard.publish(f"{base}/answer", answer, qos=1)
+
+    def handle(message: aiomqtt.Message) -> None:
+        if str(message.topic) == owner_topic:
+            ownership.receive(_payload(message), message.retain)
+            return
+        if not message.retain:
+            barrier.raise_for(_command_name(message))
+        _obey(message, door, safety_reports)
+
+    async def publish_marker(marker: str) -> None:
+        await guard.publish(f"{base}/order", marker, qos=1)
+
+    barrier = OrderBarrier(broker.claim.instance)
+    safety_reports = Reports(publish_safety_answer, 0.0)
+    ownership.forget_heard()
+    async with broker.client("safety", handle) as guard, asyncio.TaskGroup() as tasks:
+        watching = tasks.create_task(_wait_for_disconnect(guard))
+        await guard.subscribe(owner_topic, qos=1)
+        await ownership.establish(publish_claim)
+        keeping = tasks.create_task(ownership.keep(publish_claim))
+        others = (tasks.create_task(safety_reports.run()), tasks.create_task(barrier.run(publish_marker)))
+        await guard.subscribe([(f"{base}/do/{name}", 1) for name in sorted(SAFETY)])
+        door.late_listeners.append(safety_reports.add)
+        try:
+            await _publish_and_obey(broker, config, door, barrier)
+        except asyncio.CancelledError:
+            # The program ends, unless it was another task that failed: the name is free for the next bridge.
+            failed = any(task.done() for task in (watching, keeping, *others))
+            keeping.cancel()
+            if not failed:
+                with suppress(aiomqtt.MqttError, TimeoutError):
+                    async with asyncio.timeout(_LEAVES_S):
+                        await publish_claim(b"", True)
+            raise
+        finally:
+            door.late_listeners.remove(safety_reports.add)
 
 
-async def _publish(client: aiomqtt.Client, door: Door, base: str) -> None:
-    said = ""
+async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
+    """Wait until the connection ends, which raises MqttError; the inbox takes all messages."""
+    async for _ in client.messages:
+        pass
+
+
+async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door, barrier: OrderBarrier) -> None:
+    """Publish the values, and obey the commands that are no safety commands, on a connection of their own."""
+    base = broker.base
+
+    async def publish_answer(answer: str) -> None:
+        await client.publish(f"{base}/answer", answer, qos=1)
+
+    def handle(message: aiomqtt.Message) -> None:
+        topic, name = str(message.topic), _command_name(message)
+        if topic == f"{base}/availability":
+            availability.receive(_payload(message))
+        elif topic == f"{base}/order":
+            barrier.receive(_payload(message))
+        elif is_safety_command(name):
+            return  # it also comes on the other connection
+        elif barrier.newest and name not in MOVES_NOTHING:
+            reports.add_refusal(f"{name} refused: {overtaken(barrier.newest)}")
+        else:
+            _obey(message, door, reports)
+
+    availability = Availability()
+    reports = Reports(publish_answer, _REPORT_PAUSE_S)
+    will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
+    async with broker.client("values", handle, will) as client:
+        print(f"mqtt: connected to {broker.where}", file=sys.stderr, flush=True)
+        await client.subscribe([(f"{base}/{topic}", 1) for topic in ("do/+", "availability", "order")])
+        if config.discovery_prefix:
+            topic = f"{config.discovery_prefix}/device/membrane_{door.settings.name}/config"
+            await client.publish(topic, json.dumps(discovery(door, base)), qos=1, retain=True)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(_wait_for_disconnect(client))
+                tasks.create_task(_publish(client, door, base, availability))
+                tasks.create_task(reports.run())
+        except asyncio.CancelledError:  # a clean goodbye suppresses the last will
+            with suppress(aiomqtt.MqttError, TimeoutError):
+                async with asyncio.timeout(_LEAVES_S):
+                    await client.publish(f"{base}/availability", "offline", qos=1, retain=True)
+            raise
+
+
+class Availability:
+    """What the broker holds as availability.
+
+    A broker that has not noticed the end of a former connection publishes its will later, while values flow. So the
+    topic is watched, and published again when it is wrong.
+    """
+
+    def __init__(self) -> None:
+        self._published = ""
+        self._wrong = False
+
+    def receive(self, payload: bytes) -> None:
+        """Note what is published on the topic."""
+        if self._published and payload != self._published.encode():
+            self._wrong = True
+
+    def is_due(self, now: str) -> bool:
+        """Whether `now` must be published."""
+        return self._wrong or now != self._published
+
+    def note_published(self, now: str) -> None:
+        """Note that `now` is about to be published."""
+        self._published = now
+        self._wrong = False
+
+
+async def _publish(client: aiomqtt.Client, door: Door, base: str, availability: Availability) -> None:
+    """Publish the values every period, and the availability when it changes or is wrong."""
+    next_s = time.monotonic()
     while True:
         now = "online" if door.live else "offline"
-        message = {"time_utc": datetime.now(UTC).isoformat(timespec="milliseconds"), **door.values()}
-        await client.publish(f"{base}/values", json.dumps(message))
-        if now != said:  # after the values: whoever sees `online` has them
+        due = availability.is_due(now)
+        if due or time.monotonic() >= next_s:
+            next_s = time.monotonic() + door.settings.period_s
+            message = {"time_utc": datetime.now(UTC).isoformat(timespec="milliseconds"), **door.values()}
+            await client.publish(f"{base}/values", json.dumps(message))
+        if due:  # after the values: whoever sees `online` has them
+            availability.note_published(now)
             await client.publish(f"{base}/availability", now, qos=1, retain=True)
-            said = now
-        await asyncio.sleep(door.settings.period_s)
+        await asyncio.sleep(min(_LOOK_S, max(0.0, next_s - time.monotonic())))
 
 
-async def _obey(client: aiomqtt.Client, door: Door, base: str) -> None:
-    async for message in client.messages:
-        name = str(message.topic).rpartition("/")[2]
-        if message.retain:  # an old command, delivered again at each connection
-            said = f"{name} refused: a retained message is no command"
-        else:
-            given = message.payload.decode("utf-8", "replace") if isinstance(message.payload, bytes) else ""
-            action = door.commands.get(name)
-            said = await door.ask("mqtt", name, given if action is None or action.asks else "")
-        await client.publish(f"{base}/answer", said, qos=1)
+def _obey(message: aiomqtt.Message, door: Door, reports: Reports) -> None:
+    """Hand a command on, or refuse it; the answer is reported in either case."""
+    name = _command_name(message)
+    if message.retain:  # an old command, delivered again at each connection
+        reports.add_refusal(f"{name} refused: a retained message is no command")
+        return
+    outcome = door.submit("mqtt", name, _payload(message))
+    if outcome.done():
+        reports.add_refusal(outcome.result())
+    else:
+        outcome.add_done_callback(lambda done: reports.add(done.result()))
+
+
+def _command_name(message: aiomqtt.Message) -> str:
+    return str(message.topic).rpartition("/")[2]
+
+
+def _payload(message: aiomqtt.Message) -> bytes:
+    return message.payload if isinstance(message.payload, bytes) else b""
 
 
 def discovery(door: Door, base: str) -> dict[str, Any]:

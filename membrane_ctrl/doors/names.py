@@ -3,6 +3,7 @@
 import asyncio
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,20 @@ from typing import Any
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where, lock_lines
 from membrane_ctrl.control_port.protocol import TEXT_BYTES
-from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, request
+from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.doors.command_lanes import CommandLanes
+from membrane_ctrl.doors.hold_link import SendLimits, send_command
+from membrane_ctrl.model.numbers import parse_number
+from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
 
 Value = float | str | None  # None: not known
 
-_WAITING_MOST = 8
-
-COMMANDS = {str(action.do): action for action in (*ACTIONS, STOP)}
+# Who removes a lock must be known; the clients of a bridge are not.
+_NEVER = frozenset({"unlock"})
+COMMANDS = {str(action.do): action for action in (*ACTIONS, STOP) if str(action.do) not in _NEVER}
+_SAFETY_SHOWN_S = 5.0  # the answer to a safety command stays for so long, whatever else is refused meanwhile
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +103,7 @@ def values(seen: HoldSeen) -> dict[str, Value]:
 class Door:
     """What a door knows and may do: the values, and commands by role; shared by all doors of the process."""
 
-    def __init__(self, feed: HoldFeed, config: Config) -> None:
+    def __init__(self, feed: HoldFeed, config: Config, where: Where | None = None) -> None:
         self.feed = feed
         self.settings = config.doors
         limits, flow_max = config.limits, config.loop.flow_most_um_per_s(config.pump)
@@ -105,15 +112,19 @@ class Door:
             "setpoint": (limits.displacement_min_um, limits.displacement_max_um),
             "manual": (0.0, flow_max),
         }
+        self._where = where or Where()
         self._answer = ""
-        self._turn, self._waiting = asyncio.Lock(), 0
+        self._safety_answered_s = -math.inf
+        self._lanes = CommandLanes(self._send, self._report_late)
+        self.late_listeners: list[Callable[[str], None]] = []  # get the late outcomes of safety commands
         self.opening = asyncio.Lock()  # one door after the other: a server blocks the event loop while it opens
 
     @classmethod
     def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Door":
         """A door to the hold of a configuration, or to another one."""
         folder = logs or Path(config.recording.logs_dir)
-        return cls(HoldFeed(Where(socket or config.port.socket_in(folder), logs=folder)), config)
+        where = Where(socket or config.port.socket_in(folder), logs=folder)
+        return cls(HoldFeed(where), config, where)
 
     def values(self) -> dict[str, Value]:
         """The values of `TABLE` now."""
@@ -130,34 +141,137 @@ class Door:
         user = WebUser("", self.settings.role)
         return {name: action for name, action in COMMANDS.items() if may(user, "tune", action)}
 
-    async def ask(self, by: str, name: str, given: Any = "") -> str:
-        """Send a command for the door `by`; returns what became of it, in one line."""
-        self._answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {await self._asked(by, name, given)}"
-        return self._answer
+    async def ask(self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = "") -> str:
+        """Send a command, as `submit`, and wait for what became of it."""
+        return await self.submit(by, name, given, role, who)
 
-    async def _asked(self, by: str, name: str, given: Any) -> str:
+    def submit(
+        self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = ""
+    ) -> asyncio.Future[str]:
+        """Accept or refuse a command at once.
+
+        Parameters
+        ----------
+        by : str
+            The bridge: `mqtt`, `opcua` or `epics`.
+        name : str
+            Name of the command.
+        given : object
+            Its number or text, as the client sent it.
+        role, who : str
+            Role and name of the client, where the bridge knows them; the configured role limits both.
+
+        Returns
+        -------
+        Future of str
+            What became of it, in one line.
+        """
+        try:
+            asked = self._request(by, name, given, role or self.settings.role, who)
+        except ValueError as error:
+            outcome: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+            outcome.set_result(str(error))
+        else:
+            outcome = self._lanes.submit(asked)
+        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+        def note(done: asyncio.Future[str]) -> None:
+            if not answer.done():
+                answer.set_result(self._noted(by, name, done.result()))
+
+        if outcome.done():
+            note(outcome)
+        else:
+            outcome.add_done_callback(note)
+        return answer
+
+    async def close(self) -> None:
+        """End what is under way."""
+        await self._lanes.close()
+
+    def _noted(self, by: str, name: str, outcome: str) -> str:
+        """Note an outcome as the value `answer`; refusals of a flood do not replace a safety command's answer."""
+        answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome}"
+        safety = is_safety_command(name)
+        now_s = time.monotonic()
+        if safety or now_s - self._safety_answered_s > _SAFETY_SHOWN_S or outcome.endswith(": done"):
+            self._answer = answer
+        if safety:
+            self._safety_answered_s = now_s
+        return answer
+
+    def _report_late(self, outcome: str) -> None:
+        answer = self._noted("late", outcome.partition(":")[0].partition(" ")[0], outcome)
+        for listener in self.late_listeners:
+            listener(answer)
+
+    def _send(self, asked: dict[str, Any], limits: SendLimits) -> str:
+        return send_command(self._where, self.feed.seen.name, asked, limits)
+
+    def _request(self, by: str, name: str, given: Any, role: Role, who: str) -> dict[str, Any]:
+        """The request of a command. Raises ValueError with what is wrong, in one line."""
         action = COMMANDS.get(name)
         if action is None:
-            return "no such command"
-        if not may(WebUser(by, self.settings.role), self.feed.seen.role, action):
-            return f"{name} refused: needs the role {action.role}"
-        try:
-            text = str(given)
-            if len(text) > TEXT_BYTES:  # the port would drop a client that sends too much
-                raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
-            asked = request(action, f"door: {by}", text)
-            asked["on_behalf"] = {"via": "bridge", "name": by, "role": self.settings.role}
-        except ValueError as error:
-            return str(error)
-        return await self._in_turn(asked)
+            raise ValueError("no such command")
+        # The role at the port is known only after the first contact: it must not refuse a safety command.
+        port_role = "tune" if is_safety_command(name) else self.feed.seen.role
+        allowed = may(WebUser(by, self.settings.role), port_role, action) and outranks(role, action.role)
+        if not allowed:
+            raise ValueError(f"{name} refused: needs the role {action.role}")
+        why = f"door: {by}, {who}" if who else f"door: {by}"
+        asked = request(action, why, self._text(action, name, given))
+        asked["on_behalf"] = {"via": "bridge", "name": by, "role": role}
+        return asked
 
-    async def _in_turn(self, asked: dict[str, Any]) -> str:
-        """One request after the other: the port would drop clients of one name that crowd it, the feed among them."""
-        if self._waiting >= _WAITING_MOST and asked["do"] != STOP.do:
-            return f"{asked['do']} refused: too many commands at once"
-        self._waiting += 1
+    def _text(self, action: Action, name: str, given: Any) -> str:
+        """The number or text of a command as `request` accepts it. Raises ValueError."""
+        if action.asks == "number":
+            return _number_text(action, given)
+        if not action.asks:
+            return ""
+        if isinstance(given, bytes):
+            given = _decoded(given, name)
+        text = str(given)
+        if is_safety_command(name):
+            return _cleaned(text)
+        if len(text.encode("utf-8", "replace")) > TEXT_BYTES:  # the port would drop a client that sends too much
+            raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
+        return text
+
+
+def _number_text(action: Action, given: Any) -> str:
+    """A number in the notation of `request`. Raises ValueError for whatever is not exactly one finite number."""
+    if isinstance(given, bytes):
+        given = _decoded(given[: TEXT_BYTES + 1], str(action.do))
+    if isinstance(given, str):
+        if len(given.encode("utf-8", "replace")) > TEXT_BYTES:
+            raise ValueError(f"{action.do} refused: longer than {TEXT_BYTES} bytes")
         try:
-            async with self._turn:
-                return await asyncio.to_thread(self.feed.ask, asked)
-        finally:
-            self._waiting -= 1
+            given = parse_number(given)
+        except ValueError as error:
+            raise ValueError(f"{action.label}: enter a number in {action.unit}: {error}") from None
+    if isinstance(given, bool) or not isinstance(given, float | int):
+        raise ValueError(f"{action.label}: enter a number in {action.unit}")
+    try:
+        number = float(given)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(f"{action.label}: enter a finite number in {action.unit}")
+    return repr(number)
+
+
+def _decoded(payload: bytes, name: str) -> str:
+    """A payload as text. Raises ValueError for one that is no UTF-8, unless the command makes the mirror safe."""
+    if is_safety_command(name):
+        return payload.decode("utf-8", "replace")
+    try:
+        return payload.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{name} refused: the payload is not text in UTF-8") from None
+
+
+def _cleaned(text: str) -> str:
+    """The printable part of a safety command's text: a bad text must not refuse the command."""
+    printable = "".join(c if c.isprintable() else "?" for c in text[:TEXT_BYTES])
+    return printable.encode("utf-8", "replace")[:TEXT_BYTES].decode("utf-8", "ignore")

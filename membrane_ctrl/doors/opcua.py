@@ -1,44 +1,49 @@
 """The door to OPC UA: a server with one object; its variables are the published values, its methods the commands.
 
-Without contact to the hold a variable has the status `BadNoCommunication` and no value.
+Without contact to the hold a variable has the status `BadNoCommunication` and no value. Sessions are anonymous, or of
+the users of a file; without a certificate they are not encrypted.
 """
 
 import asyncio
 import sys
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from asyncua import Server, ua
 from asyncua.common.node import Node
-from asyncua.crypto.permission_rules import User, UserRole
+from cryptography.hazmat.primitives.asymmetric import rsa
 
 from membrane_ctrl.config.port import OpcuaConfig
 from membrane_ctrl.doors.names import TABLE, Door, Value
-from membrane_ctrl.model import errors
-from membrane_ctrl.web.access import Action
+from membrane_ctrl.doors.opcua_server import AnonymousClients, BridgeServer, NamedClients, caller
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.web.access import Action, KnownUser, known_users
 
 _UNITS = "http://www.opcfoundation.org/UA/units/un/cefact"
-
-
-class _Everybody:
-    """Every client is a plain user: asyncua's own manager makes an administrator of whoever says `admin`."""
-
-    def get_user(self, *_: Any, **__: Any) -> User:
-        return User(UserRole.User)
+_OPEN = [ua.SecurityPolicyType.NoSecurity]
+_ENCRYPTED = [
+    ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+]
 
 
 async def serve(config: OpcuaConfig, door: Door) -> None:
-    """Serve until cancelled. Raises DeviceError if the address is taken."""
+    """Serve until cancelled.
+
+    Raises InputError for a bad file of users, certificate or key, DeviceError if the address is taken.
+    """
     where = f"opc.tcp://{config.host}:{config.port}/membrane_ctrl"
+    users = _read_users(config)
     async with door.opening:
-        server = Server(user_manager=_Everybody())
+        server = BridgeServer(AnonymousClients() if users is None else NamedClients(users))
         await server.init()
         server.set_endpoint(where)
         server.set_server_name("membrane_ctrl")
-        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
-        server.set_identity_tokens([ua.AnonymousIdentityToken])
+        await _secure(server, config, door.settings.name)
         space = await server.register_namespace(f"urn:membrane-ctrl:{door.settings.name}")
-        nodes = await _nodes(server, space, door)
+        nodes = await _nodes(server, space, door, users)
         await _show(server, nodes, door)  # nobody may see the zeros that the variables were made with
         try:
             await server.start()
@@ -53,12 +58,51 @@ async def serve(config: OpcuaConfig, door: Door) -> None:
         await server.stop()
 
 
+def _read_users(config: OpcuaConfig) -> dict[str, KnownUser] | None:
+    """The users by name; None if clients are anonymous. Raises InputError."""
+    if config.users_file is None:
+        return None
+    try:
+        text = files.read_text(Path(config.users_file), follow=True)
+    except (OSError, ValueError) as error:
+        raise errors.InputError(f"doors.opcua.users_file: {error}") from None
+    users = known_users(text, config.users_file)
+    if not users:
+        raise errors.InputError(
+            f"doors.opcua.users_file: {config.users_file} has no users; add one with web add-user"
+        )
+    return users
+
+
+async def _secure(server: BridgeServer, config: OpcuaConfig, name: str) -> None:
+    """Set how sessions are encrypted and who they may belong to. Raises InputError."""
+    server.set_identity_tokens([ua.AnonymousIdentityToken if config.users_file is None else ua.UserNameIdentityToken])
+    server.set_security_policy(_ENCRYPTED if config.encrypted else _OPEN)
+    if not config.encrypted:
+        return
+    assert config.certificate_file is not None
+    assert config.key_file is not None
+    await server.set_application_uri(f"urn:membrane-ctrl:{name}")
+    for key, file, load in (
+        ("certificate_file", config.certificate_file, server.load_certificate),
+        ("key_file", config.key_file, server.load_private_key),
+    ):
+        try:
+            await load(Path(file), format="pem")
+        except (OSError, ValueError, TypeError) as error:
+            raise errors.InputError(f"doors.opcua.{key}: {file}: {error}") from None
+    if not isinstance(server.iserver.certificate.public_key(), rsa.RSAPublicKey):
+        raise errors.InputError(f"doors.opcua.certificate_file: {config.certificate_file}: OPC UA needs an RSA key")
+    if not isinstance(server.iserver.private_key, rsa.RSAPrivateKey):
+        raise errors.InputError(f"doors.opcua.key_file: {config.key_file}: OPC UA needs an RSA key")
+
+
 async def _show(server: Server, nodes: dict[str, Node], door: Door) -> None:
     for name, value in door.values().items():
         await server.write_attribute_value(nodes[name].nodeid, _data(value, door.live))
 
 
-async def _nodes(server: Server, space: int, door: Door) -> dict[str, Node]:
+async def _nodes(server: Server, space: int, door: Door, users: dict[str, KnownUser] | None) -> dict[str, Node]:
     """Make the object with its variables and methods; returns the variables by name."""
     name = door.settings.name
     mirror = await server.nodes.objects.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
@@ -76,7 +120,7 @@ async def _nodes(server: Server, space: int, door: Door) -> dict[str, Node]:
         given = [_argument(action)] if action.asks else []
         node_id, browse_name = ua.NodeId(f"{name}.do.{do}", space), ua.QualifiedName(do, space)
         answer = ua.Argument(Name="answer", DataType=ua.NodeId(ua.ObjectIds.String))
-        await mirror.add_method(node_id, browse_name, _method(door, do), given, [answer])
+        await mirror.add_method(node_id, browse_name, _method(door, do, users), given, [answer])
     return found
 
 
@@ -88,11 +132,13 @@ def _argument(action: Action) -> ua.Argument:
     )
 
 
-def _method(door: Door, do: str) -> Any:
+def _method(door: Door, do: str, users: dict[str, KnownUser] | None) -> Any:
     async def call(parent: ua.NodeId, *given: ua.Variant) -> list[ua.Variant] | ua.StatusCode:
         if len(given) > 1 or any(not isinstance(each.Value, float | int | str) for each in given):
             return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-        said = await door.ask("opcua", do, given[0].Value if given else "")
+        who = caller.get()
+        role = None if users is None else users[who].role
+        said = await door.ask("opcua", do, given[0].Value if given else "", role, who)
         return [ua.Variant(said, ua.VariantType.String)]
 
     return call

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import json
 import math
@@ -29,6 +28,23 @@ from tests.control_port.port_run import port_run
 
 PAGE = Path(__file__).parents[2] / "docs" / "doors.md"
 SUFFIX = {"um": "_um", "um/s": "_um_per_s", "Pa": "_pa", "°C": "_c", "ms": "_ms", "s": "_s", "": ""}
+STRANGE_NUMBERS = (
+    "1,000",
+    "1_0",
+    "٣",
+    "nan",
+    "inf",
+    "-inf",
+    "1e400",
+    "0x10",
+    "",
+    " ",
+    "1 ",
+    "1 2",
+    "1;2",
+    "--1",
+    "½",
+)
 FAULT = {"code": 7, "name": "laser_lost", "cause": "no light", "remedy": "clean it"}
 
 
@@ -44,9 +60,10 @@ def figure(**changed: object) -> ShapeEstimate:
 
 
 def door_with(role: str = "read", seen: HoldSeen | None = None, port: Path | None = None) -> Door:
-    feed = HoldFeed(Where(socket=port))
+    where = Where(socket=port)
+    feed = HoldFeed(where)
     feed.seen = seen or seen_hold()
-    return Door(feed, Config(doors=DoorsConfig(role=role)))  # type: ignore[arg-type]
+    return Door(feed, Config(doors=DoorsConfig(role=role)), where)  # type: ignore[arg-type]
 
 
 def test_names_are_unique_and_carry_their_units() -> None:
@@ -138,14 +155,26 @@ def test_the_locks_are_published() -> None:
 
 async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
     door = door_with("tune", dataclasses.replace(seen_hold(), role="read"))
-    assert "stop refused: needs the role operate" in await door.ask("epics", "stop")
+    assert "setpoint refused: needs the role operate" in await door.ask("epics", "setpoint", "1")
+
+
+async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path) -> None:
+    """The role at the port is not known yet; the port itself judges."""
+    async with port_run(tmp_path) as run:
+        door = door_with("operate", HoldSeen(""), tmp_path / "control.sock")
+        assert (await door.ask("epics", "stop")).endswith("stop: done")
+        assert [asked.kind for asked in run.asked] == ["stop"]
 
 
 @pytest.mark.parametrize(
     ("command", "given", "says"),
     [
         ("setpoint", "", "enter a number"),
-        ("setpoint", "nan", "enter a number in um: 'nan' is not a plain decimal number"),
+        *(("setpoint", text, "Setpoint: enter a number in um") for text in STRANGE_NUMBERS),
+        *(("setpoint", number, "enter a finite number") for number in (math.nan, math.inf, 10**400)),
+        ("setpoint", True, "enter a number"),
+        ("setpoint", b"\xff\xfe", "setpoint refused: the payload is not text in UTF-8"),
+        ("mark", b"\xff\xfe", "mark refused: the payload is not text in UTF-8"),
         ("setpoint", "1e9", "outside the limits"),
         ("mark", "a\nb", "printable"),
         ("mark", "x" * 501, "longer than 500 bytes"),
@@ -156,31 +185,11 @@ async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
         ("__class__", "", "no such command"),
     ],
 )
-async def test_nonsense_gets_an_answer(tmp_path: Path, command: str, given: str, says: str) -> None:
+async def test_nonsense_gets_an_answer(tmp_path: Path, command: str, given: object, says: str) -> None:
     async with port_run(tmp_path) as run:
         door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
         assert says in await door.ask("opcua", command, given)
         assert run.asked == [] or given == "1e9", "the tick judges limits"
-
-
-async def test_a_crowd_of_commands_waits_its_turn_and_stop_gets_through(monkeypatch: pytest.MonkeyPatch) -> None:
-    door = door_with("operate", dataclasses.replace(seen_hold(), role="operate"))
-    inside, most, sent = 0, 0, []
-
-    def ask(request: dict[str, object]) -> str:
-        nonlocal inside, most
-        inside, most = inside + 1, max(most, inside + 1)
-        sent.append(request["do"])
-        time.sleep(0.001)  # the others would come in now
-        inside -= 1
-        return "done"
-
-    monkeypatch.setattr(door.feed, "ask", ask)
-    said = await asyncio.gather(*(door.ask("opcua", "mark", "x") for _ in range(50)), door.ask("epics", "stop"))
-    assert most == 1
-    assert sent == ["mark"] * 8 + ["stop"]
-    assert sum("too many commands at once" in each for each in said) == 42
-    assert (await door.ask("opcua", "mark", "x")).endswith("done")
 
 
 def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None:

@@ -1,0 +1,50 @@
+"""Who may read and act through each bridge of a configuration, in words for `check`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from membrane_ctrl.config.port import LOCAL_HOSTS, DoorsConfig
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeAccess:
+    """Who may use a bridge."""
+
+    field: str  # of the configuration
+    where: str  # its address
+    who: str  # may read, and act as far as the role allows
+    unknown: bool  # whether clients act that neither this program nor a broker's log-in can name
+
+
+def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
+    """The configured bridges."""
+    found = []
+    if doors.mqtt is not None:
+        mqtt = doors.mqtt
+        who = "whoever the broker lets publish there (its access list)"
+        where = f"MQTT by the broker {mqtt.host}:{mqtt.port}"
+        found.append(BridgeAccess("doors.mqtt", where, who, mqtt.username is None))
+    if doors.opcua is not None:
+        opcua = doors.opcua
+        where = f"OPC UA on {opcua.host}:{opcua.port}" + (", encrypted" if opcua.encrypted else "")
+        known = opcua.users_file is not None
+        who = f"the users in {opcua.users_file}, each by its role" if known else _anybody(opcua.host)
+        found.append(BridgeAccess("doors.opcua", where, who, not known))
+    if doors.epics is not None:
+        where = f"EPICS on {doors.epics.host}"
+        found.append(BridgeAccess("doors.epics", where, _anybody(doors.epics.host), True))
+    return found
+
+
+def describe_bridges(doors: DoorsConfig) -> str:
+    """The configured bridges, and who may do what through them, in one line."""
+    accesses = bridge_accesses(doors)
+    if not accesses:
+        return "none"
+    may = "read, and nobody acts" if doors.role == "read" else f"read and act (role {doors.role} at most)"
+    return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)
+
+
+def _anybody(host: str) -> str:
+    return "every program on this machine" if host in LOCAL_HOSTS else "every program on the network"

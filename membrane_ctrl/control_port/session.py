@@ -1,0 +1,92 @@
+"""One client of the port from greeting to goodbye."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from membrane_ctrl.control_port.protocol import Peer, Request, RequestError, SlowReaderError, Wire
+from membrane_ctrl.control_port.request_intake import ReadingTurns, RequestIntake
+from membrane_ctrl.model.events import Event
+
+Answer = Callable[["PortSession", Request], Awaitable[dict[str, Any]]]
+Refused = Callable[[str, str, str], None]
+
+
+class PortSession:
+    """A connection whose peer is known; `watch` streams `status`."""
+
+    def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]], turns: ReadingTurns) -> None:
+        self.peer = peer
+        self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
+        self._wire = wire
+        self._status = status
+        self._turns = turns
+        self._intake: RequestIntake | None = None
+        self._watch: asyncio.Task[None] | None = None
+
+    async def run(self, greeting: dict[str, Any], answer: Answer, refused: Refused) -> None:
+        """Answer requests until the peer disconnects."""
+        try:
+            self._wire.send(greeting)
+            await self._converse(answer, refused)
+        except SlowReaderError as error:
+            refused(self.peer.who, "", str(error))
+        except RequestError as error:
+            refused(self.peer.who, "", str(error))
+            with contextlib.suppress(SlowReaderError):
+                self._wire.send({"number": 0, "ok": False, "refused": str(error)})
+        finally:
+            self.watch(None)
+            await self._wire.close()
+
+    async def _converse(self, answer: Answer, refused: Refused) -> None:
+        async def answer_request(request: Request) -> dict[str, Any]:
+            return await answer(self, request)
+
+        async def read_lines() -> list[bytes] | None:
+            lines = await self._wire.lines()
+            self.heard_s = asyncio.get_running_loop().time()
+            return lines
+
+        def record_refusal(command: str, reason: str) -> None:
+            refused(self.peer.who, command, reason)
+
+        self._intake = RequestIntake(self._wire, answer_request, record_refusal, self._turns)
+        await self._intake.serve(read_lines)
+
+    def refuse_waiting(self, winner: str) -> None:
+        """Refuse the waiting commands that could undo the safety command `winner`."""
+        if self._intake is not None:
+            with contextlib.suppress(SlowReaderError):
+                self._intake.refuse_waiting(winner)
+
+    def notice(self, text: str) -> None:
+        """Send an unsolicited notice."""
+        with contextlib.suppress(SlowReaderError):
+            self._wire.send({"notice": text})
+
+    def event(self, event: Event) -> None:
+        """Send an event to a watching peer."""
+        if self._watch is not None:
+            with contextlib.suppress(SlowReaderError):
+                self._wire.send({"event": event.to_dict()})
+
+    def watch(self, period_s: float | None) -> None:
+        """Stream the status from now on; None ends it."""
+        if self._watch is not None:
+            self._watch.cancel()
+        self._watch = None if period_s is None else asyncio.create_task(self._stream(period_s), name="port watch")
+
+    async def _stream(self, period_s: float) -> None:
+        with contextlib.suppress(SlowReaderError):
+            while True:
+                await asyncio.sleep(period_s)
+                self._wire.send({"status": self._status()})
+
+    def drop(self, why: str) -> None:
+        """End the connection with a last message."""
+        self.notice(why)
+        self._wire.abort()

@@ -1,0 +1,18 @@
+"""Findings on the bridges to other systems: who may act without being known."""
+
+from membrane_ctrl.config.bridge_access import bridge_accesses
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.cross_check_plant import ConfigFindings
+
+_REMEDIES = {
+    "doors.mqtt": "give username and password_file, and let the broker's access list decide",
+    "doors.opcua": "give users_file, or set the role to read",
+    "doors.epics": "set the role to read, unless every user of this machine may act",
+}
+
+
+def judge_bridges(config: Config, say: ConfigFindings) -> None:
+    """Warn of bridges through which clients may act whom nobody knows."""
+    for bridge in bridge_accesses(config.doors):
+        acts = bridge.unknown and config.doors.role != "read"
+        say.warn(acts, "doors.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field])

@@ -1,0 +1,177 @@
+"""Who publishes under a name at an MQTT broker: one bridge, by a claim that all bridges of that name can see.
+
+The claim is a retained message on `membrane/NAME/owner`. Its owner publishes it again every `BEAT_S`, and at once
+when it hears another bridge, so a claim without an owner is recognised by its silence. A bridge that starts
+
+1. reads the retained claim, and publishes its own, not retained;
+2. listens: `SETTLE_S` if there is no other claim, `SILENT_S` if there is one;
+3. ends with an error as soon as it hears a live claim that outranks its own; else it is the owner.
+
+Two claims are compared by the time since which they are owned; a bridge that is not an owner yet ranks behind every
+owner, and equal ones are ordered by their random identifiers. So of two bridges that start together, one goes on; an
+owner is not displaced by a newcomer; and an owner whose connection was interrupted gets its name back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import re
+import secrets
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+
+from membrane_ctrl.model import errors
+
+BEAT_S = 2.0
+SETTLE_S = 1.0  # several times the way through a broker and the start of a process on a busy machine
+SILENT_S = 5.0  # more than two beats
+_RETAINED_S = 0.3  # a broker delivers the retained claim right after the subscription
+_BETWEEN_ANSWERS_S = 0.2  # a flood of claims is not answered by a flood
+_CLAIM_BYTES = 512
+_HOST_LENGTH = 64
+_INSTANCE = re.compile(r"[0-9a-f]{16}")
+
+Publish = Callable[[bytes, bool], Awaitable[None]]  # payload, retained
+
+
+@dataclass(frozen=True, slots=True)
+class OwnerClaim:
+    """The claim of one process to a name."""
+
+    instance: str  # random, of the process
+    host: str
+    pid: int
+    since_s: float | None = None  # UTC since which it owns the name; None: not yet
+
+    @classmethod
+    def of_this_process(cls) -> OwnerClaim:
+        """A claim of this process, which owns nothing yet."""
+        return cls(secrets.token_hex(8), socket.gethostname()[:_HOST_LENGTH], os.getpid())
+
+    def encode(self) -> bytes:
+        """The message."""
+        return json.dumps(asdict(self)).encode()
+
+    def outranks(self, other: OwnerClaim) -> bool:
+        """Whether this claim's process keeps the name."""
+        return self._rank() < other._rank()
+
+    def _rank(self) -> tuple[float, str]:
+        since_s = math.inf if self.since_s is None else self.since_s
+        return since_s, self.instance
+
+
+def parse_claim(payload: bytes) -> OwnerClaim | None:
+    """The claim in a message; None for anything else, which anybody may have published."""
+    if len(payload) > _CLAIM_BYTES:
+        return None
+    with suppress(ValueError, TypeError, RecursionError):
+        claim = OwnerClaim(**json.loads(payload))
+        since_s = claim.since_s
+        owned = since_s is None or (type(since_s) in (int, float) and math.isfinite(since_s) and since_s >= 0.0)
+        if (
+            owned
+            and _INSTANCE.fullmatch(claim.instance)
+            and type(claim.pid) is int
+            and len(claim.host) <= _HOST_LENGTH
+            and claim.host.isprintable()
+        ):
+            return claim
+    return None
+
+
+class NameOwnership:
+    """This process's claim to a name, over any number of connections to the broker.
+
+    Parameters
+    ----------
+    claim : OwnerClaim
+        Of this process.
+    what : str
+        The name and the broker, for messages.
+    """
+
+    def __init__(self, claim: OwnerClaim, what: str) -> None:
+        self.claim = claim
+        self._what = what
+        self._retained: OwnerClaim | None = None
+        self._live: OwnerClaim | None = None
+        self._released = False
+        self._heard = asyncio.Event()
+
+    def receive(self, payload: bytes, retained: bool) -> None:
+        """Note a message of the owner's topic."""
+        if not payload:  # a former owner has ended
+            self._released = True
+            self._heard.set()
+            return
+        claim = parse_claim(payload)
+        if claim is None or claim.instance == self.claim.instance:
+            return
+        if retained:
+            self._retained = claim
+        elif self._live is None or claim.outranks(self._live):
+            self._live = claim
+        self._heard.set()
+
+    async def establish(self, publish: Publish) -> None:
+        """Become the owner; call it after each connection. Raises DeviceError if another bridge has the name."""
+        await asyncio.sleep(_RETAINED_S)
+        await publish(self.claim.encode(), False)
+        deadline_s = time.monotonic() + self._listening_s()
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            if self._released:
+                # Others may also have waited for that.
+                self._released = False
+                deadline_s = min(deadline_s, time.monotonic() + SETTLE_S)
+            if await self._rival_heard(min(left_s, SETTLE_S)):
+                await publish(self.claim.encode(), False)
+                await asyncio.sleep(_BETWEEN_ANSWERS_S)
+        if self.claim.since_s is None:
+            self.claim = replace(self.claim, since_s=time.time())
+        await publish(self.claim.encode(), True)
+
+    async def keep(self, publish: Publish) -> None:
+        """Renew the claim until cancelled. Raises DeviceError if a bridge with an older claim has come back."""
+        while True:
+            await self._rival_heard(BEAT_S)
+            await publish(self.claim.encode(), True)
+            await asyncio.sleep(_BETWEEN_ANSWERS_S)
+
+    def forget_heard(self) -> None:
+        """Forget what an earlier connection has delivered."""
+        self._retained = self._live = None
+        self._released = False
+
+    def _listening_s(self) -> float:
+        """How long to listen before this process owns the name."""
+        other = self._retained
+        owner = self.claim.since_s is not None
+        if owner and (other is None or self.claim.outranks(other)):
+            return 0.0
+        return SETTLE_S if other is None else SILENT_S
+
+    async def _rival_heard(self, timeout_s: float) -> bool:
+        """Wait for a live claim of another process; returns whether there was one, which ranks behind this one.
+
+        Raises DeviceError if it ranks before this one.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._heard.wait()
+        self._heard.clear()
+        rival, self._live = self._live, None
+        if rival is None:
+            return False
+        if not rival.outranks(self.claim):
+            return True
+        raise errors.DeviceError(
+            f"mqtt: {self._what} is in use by another bridge (process {rival.pid} on {rival.host}); "
+            "stop that one, or choose another doors.name"
+        )

@@ -1,0 +1,88 @@
+"""No command of a bridge is obeyed late, whatever hangs; safety commands are obeyed nevertheless."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.doors import command_lanes
+from membrane_ctrl.doors.hold_link import SendLimits, send_command
+from membrane_ctrl.model.telemetry import State
+from tests.control_port.port_run import port_run
+from tests.doors.test_doors import door_with, seen_hold
+
+
+def limits(seconds: float, refusal: str = "") -> SendLimits:
+    return SendLimits(time.monotonic() + seconds, lambda: refusal)
+
+
+async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) -> None:
+    """As a hold that is stopped: the kernel accepts the connection, and the hold would read it when it goes on."""
+    path = tmp_path / "control.sock"
+    with socket.socket(socket.AF_UNIX) as frozen:
+        frozen.bind(str(path))
+        frozen.listen(8)
+        door = door_with("operate", dataclasses.replace(seen_hold(), name="the-run"), path)
+        begin_s = time.monotonic()
+        assert "hold refused: not obeyed within 2 s" in await door.ask("mqtt", "hold")
+        assert time.monotonic() - begin_s < 2.5
+        begin_s = time.monotonic()
+        assert "latch: no answer from the hold within 0.9 s; still being sent" in await door.ask("mqtt", "latch")
+        assert time.monotonic() - begin_s < 1.0
+        waiting, _ = frozen.accept()  # the hold goes on
+        waiting.sendall(b'{"membrane_ctrl": 1, "run": "the-run"}\n')
+        waiting.settimeout(1.0)
+        assert waiting.recv(1000) == b"", "the hold command is not sent any more"
+        waiting.close()
+        latching, _ = frozen.accept()
+        latching.sendall(b'{"membrane_ctrl": 1, "run": "the-run"}\n')
+        latching.settimeout(5.0)
+        assert b'"do": "latch"' in await asyncio.to_thread(latching.recv, 1000)
+        latching.close()
+        await door.close()
+
+
+async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_path: Path) -> None:
+    async with port_run(tmp_path) as run:
+        run.state = State.STANDBY
+        where = Where(socket=tmp_path / "control.sock")
+        greeted_s = run.now_s
+
+        def refusal() -> str:  # the hold hangs for a minute, right after its greeting
+            run.now_s = greeted_s + 60.0
+            return ""
+
+        asked = {"do": "hold", "why": "door: mqtt"}
+        late = SendLimits(time.monotonic() + 2.0, refusal)
+        said = await asyncio.to_thread(send_command, where, "the-run", asked, late)
+        assert "hold refused: hold came 58" in said
+        assert run.asked == []
+
+
+async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_path: Path) -> None:
+    async with port_run(tmp_path) as run:
+        where = Where(socket=tmp_path / "control.sock")
+        for given, says in (
+            (limits(-0.1), "the hold answered too late"),
+            (limits(2.0, "latch came meanwhile"), "hold refused: latch came meanwhile"),
+        ):
+            assert says in await asyncio.to_thread(send_command, where, "the-run", {"do": "hold"}, given)
+        said = await asyncio.to_thread(send_command, where, "another-run", {"do": "hold"}, limits(2.0))
+        assert "another run is listening now" in said
+        said = await asyncio.to_thread(send_command, where, "another-run", {"do": "stop"}, limits(-5.0, "no"))
+        assert said == "stop: done", "a safety command has no conditions"
+        assert [command.kind for command in run.asked] == ["stop"]
+
+
+async def test_no_hold_is_answered_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    door = door_with("operate", None, tmp_path / "control.sock")
+    for name in ("hold", "latch"):
+        begin_s = time.monotonic()
+        assert "no hold is listening" in await door.ask("mqtt", name)
+        assert time.monotonic() - begin_s < command_lanes.SAFETY_ANSWER_S
