@@ -138,6 +138,7 @@ class GainsPart(_Part):
 class SessionPart(_Part):
     """The session that has command of the hold."""
 
+    id: _Text
     what: _Text
     who: _Text
     pid: _Count | None = None
@@ -203,10 +204,13 @@ class Streamed(_Part):
 
 
 class Notice(_Part):
-    """A message for the person at the client."""
+    """A message for the person at the client; a `code` makes it one for the program as well."""
 
     notice: _Text
+    code: _Name | None = None
 
+
+COMMAND_TAKEN = "command_taken"  # the code of a notice: another client has command now
 
 Kind = Literal["answer", "notice", "streamed", "unknown"]
 

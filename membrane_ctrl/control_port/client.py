@@ -43,6 +43,8 @@ class PortClient:
     ----------
     greeting : dict
         `run`, `you`, `role`, `commander`.
+    command_taken : str
+        Who has taken over command from this client, and why; empty if nobody has.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class PortClient:
         self._connection, self._where, self._notice = connection, where, notice
         self._lines = lines.LineReader(connection)
         self._number = 0
+        self.command_taken = ""
         self._patience_s = ANSWER_S
         if until_s is None:
             until_s = time.monotonic() + ANSWER_S
@@ -127,6 +130,19 @@ class PortClient:
             if answers.kind_of(message) == "streamed":
                 yield message
 
+    def status(self) -> Message:
+        """Ask for the status: the whole answer. Raises DeviceError without one, also if it is refused."""
+        answer = self.ask(do="status")
+        if not answer["ok"]:
+            raise DeviceError(f"{self._where}: status refused: {answer['refused']}")
+        return answer
+
+    def poll(self) -> None:
+        """Take the notices that have arrived, without waiting. Raises DeviceError if the hold has hung up."""
+        while self._lines.waiting():
+            if self._any_message(time.monotonic() + self._patience_s) is None:
+                raise DeviceError(f"{self._where}: the hold has closed the connection; has it ended?")
+
     def patience(self, seconds: float) -> None:
         """Set how long the next message may take."""
         self._patience_s = seconds
@@ -154,15 +170,25 @@ class PortClient:
 
     def _next(self, until_s: float) -> Message | None:
         """The next checked message that is not a notice; None if the hold has hung up."""
-        while (line := self._read_line(until_s)) is not None:
-            try:
-                message = answers.check_message(answers.decode(line))
-            except answers.AnswerError as error:
-                raise self._not_of_a_hold(error) from None
+        while (message := self._any_message(until_s)) is not None:
             if answers.kind_of(message) != "notice":
                 return message
-            self._notice(message["notice"])
         return None
+
+    def _any_message(self, until_s: float) -> Message | None:
+        """The next checked message, after it was passed on if it is a notice; None if the hold has hung up."""
+        line = self._read_line(until_s)
+        if line is None:
+            return None
+        try:
+            message = answers.check_message(answers.decode(line))
+        except answers.AnswerError as error:
+            raise self._not_of_a_hold(error) from None
+        if answers.kind_of(message) == "notice":
+            if message.get("code") == answers.COMMAND_TAKEN:
+                self.command_taken = message["notice"]
+            self._notice(message["notice"])
+        return message
 
     def _checked_answer(self, answer: Message, request: Message) -> Message:
         """Check what an answer must bring: the status that was asked for, or a reason."""

@@ -13,6 +13,7 @@ from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
 from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
+from membrane_ctrl.control_port.commander import CommandSession
 from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
 
 _FLEET_S = 10.0  # for all holds of a fleet, which are asked at once
@@ -129,8 +130,16 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
     lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
     lines += [f"  {'recording':15}{message}" for message in status.get("recording", {}).values()]
-    lines.append(f"  {'commander':15}{status.get('commander') or 'nobody'}")
+    lines.append(f"  {'commander':15}{_commander(status)}")
     return lines
+
+
+def _commander(status: dict[str, Any]) -> str:
+    session = status.get("command_session")
+    if session is None:
+        return str(status.get("commander") or "nobody")
+    known = {key: session.get(key) for key in ("id", "who", "what", "pid", "since_utc")}
+    return CommandSession(**known).describe()
 
 
 def _geometry(geometry: dict[str, Any] | None) -> str:

@@ -6,7 +6,9 @@ cost the reader its memory or its time.
 
 from __future__ import annotations
 
+import select
 import socket
+import ssl
 import time
 
 # The longest line of a hold is the answer to `status`: some 5 kB, and at most 16 kB with every notice there is.
@@ -69,6 +71,13 @@ class LineReader:
         del self._unread[: end + 1]
         self._count_line()
         return line
+
+    def waiting(self) -> bool:
+        """Whether a read would return at once: something has arrived, or the peer has gone."""
+        if b"\n" in self._unread:
+            return True
+        secured = isinstance(self._connection, ssl.SSLSocket) and self._connection.pending() > 0
+        return secured or bool(select.select([self._connection], [], [], 0.0)[0])
 
     def _receive(self, until_s: float) -> bytes:
         left_s = until_s - time.monotonic()

@@ -9,17 +9,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
+import secrets
 import socket
 import ssl
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
+from membrane_ctrl.control_port.answers import COMMAND_TAKEN
 from membrane_ctrl.controller.commands import TABLE, Kind, Role
 from membrane_ctrl.model.events import Event
 
@@ -31,7 +32,7 @@ MESSAGE_BYTES = 8192
 # who, why and text go into one event, and JSON makes up to 3 bytes of one in UTF-8: together they fit its slot
 WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
-Errand = Literal["status", "watch", "release", "quiet"]
+Errand = Literal["status", "watch", "release", "quiet", "claim"]
 Action = Literal[Kind, Errand]
 
 
@@ -54,16 +55,20 @@ def _words(most_bytes: int) -> AfterValidator:
     return AfterValidator(check)
 
 
+_ERRAND_NEEDS: dict[str, tuple[str, ...]] = {"claim": ("text",)}
+
+
 class Request(Section):
     """A client's request."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
-    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `release` (give up command),
-    # `quiet` (acknowledge the alarms)
+    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command for this connection,
+    # a session), `release` (give up command), `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
-    text: Annotated[str, _words(TEXT_BYTES)] = ""  # `mark`: the remark. `latch`: why the mirror is locked
+    # `mark`: the remark. `latch`: why the mirror is locked. `claim`: the session's name
+    text: Annotated[str, _words(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
     experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
@@ -75,7 +80,7 @@ class Request(Section):
     @model_validator(mode="after")
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
-        needs, takes = (rule.needs, rule.takes) if rule else ((), ())
+        needs, takes = (rule.needs, rule.takes) if rule else (_ERRAND_NEEDS.get(self.do, ()), ())
         for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s", "setpoint_step_um"):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
@@ -196,7 +201,9 @@ class Wire:
 
 
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
-_ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
+_ERRANDS: dict[str, Role] = {
+    "status": "read", "watch": "read", "claim": "operate", "release": "operate", "quiet": "operate",
+}  # fmt: skip
 
 # These need no command: stopping the pump is always accepted, and the others move nothing
 FREE = frozenset({"status", "watch", "stop", "latch", "mark", "release", "quiet"})
@@ -208,6 +215,7 @@ class Peer:
 
     who: str
     role: Role
+    pid: int | None = field(default=None, compare=False)  # of its process, if it is on this machine
 
 
 def may_not(peer: Peer, do: Action) -> str:
@@ -216,32 +224,6 @@ def may_not(peer: Peer, do: Action) -> str:
     if _RANK[peer.role] >= _RANK[needed]:
         return ""
     return f"{do} needs the role {needed}; {peer.who} has {peer.role}"
-
-
-class Commander:
-    """One commander at a time: the first client to command, until it releases or loses command or idles too long."""
-
-    def __init__(self, lapses_s: float) -> None:
-        self._lapses_s = lapses_s
-        self._holder = ""
-        self._last_s = -math.inf
-
-    def holder(self, now_s: float) -> str:
-        """Who has command; empty if nobody."""
-        return self._holder if now_s - self._last_s <= self._lapses_s else ""
-
-    def claim(self, who: str, take_over: bool, now_s: float) -> str:
-        """Take or keep command; returns why not, or an empty text."""
-        holder = self.holder(now_s)
-        if holder not in ("", who) and not take_over:
-            return f"{holder} has command; take over with --take-over, or wait for its release"
-        self._holder, self._last_s = who, now_s
-        return ""
-
-    def release(self, who: str) -> None:
-        """Release command, if `who` has it."""
-        if self._holder == who:
-            self._holder = ""
 
 
 # A client that sends faster is read more slowly: all requests together cost less than a tick in fifty
@@ -258,6 +240,7 @@ class PortSession:
 
     def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]]) -> None:
         self.peer = peer
+        self.id = secrets.token_hex(4)  # of the connection
         self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
         self._wire = wire
         self._status = status
@@ -299,6 +282,11 @@ class PortSession:
         """Send an unsolicited notice."""
         with contextlib.suppress(SlowReaderError):
             self._wire.send({"notice": text})
+
+    def command_taken(self, text: str) -> None:
+        """Send the notice that this connection has lost command to another."""
+        with contextlib.suppress(SlowReaderError):
+            self._wire.send({"notice": text, "code": COMMAND_TAKEN})
 
     def event(self, event: Event) -> None:
         """Send an event to a watching peer."""

@@ -55,9 +55,9 @@ class UnixListener:
     def peer(self, connection: socket.socket) -> protocol.Peer:
         """Identity of the client, from the kernel."""
         raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        _, uid, _ = _CREDENTIALS.unpack(raw)
+        pid, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
-        return protocol.Peer(f"unix:{self._names.get(uid, uid)}", role)
+        return protocol.Peer(f"unix:{self._names.get(uid, uid)}", role, pid or None)  # 0: in another container
 
     def close(self) -> None:
         """Close it and remove the file, unless replaced by another; remove an empty folder made for it."""

@@ -90,7 +90,7 @@ async def test_one_commander_at_a_time(tmp_path: Path) -> None:
         assert (await bob.ask(do="mark", text="bob was here"))["ok"], "a mark moves nothing"
         assert (await bob.ask(do="setpoint", value=2.0, take_over=True, why="shift"))["ok"]
         notice = await ann.get()
-        assert notice == {"notice": "unix:bob has taken over command: shift"}
+        assert notice == {"notice": "unix:bob has taken over command: shift", "code": "command_taken"}
         assert "unix:bob has command" in (await ann.ask(do="setpoint", value=1.0))["refused"]
         assert [(e["who"], e["former"]) for e in run.of_kind("commander")] == [
             ("unix:ann", None),
