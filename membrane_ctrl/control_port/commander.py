@@ -2,8 +2,8 @@
 
 Single commands (`ctl`, the console, the page) come on connections of their own, so command belongs to the client's
 name and lapses some minutes after the last one. A session (tuning, calibration) sends its commands over minutes to
-hours on one connection, which it claims: then command belongs to that connection alone, not to its user. A session that
-ends, or whose process dies, closes its connection, and with it gives up command.
+hours on one connection, which it claims: then command belongs to that connection alone, not to its user. A session
+that ends, or whose process dies, closes its connection, and with it gives up command.
 """
 
 from __future__ import annotations

@@ -62,8 +62,8 @@ class Request(Section):
     """A client's request."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
-    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command for this connection,
-    # a session), `release` (give up command), `quiet` (acknowledge the alarms)
+    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command for a session,
+    # this connection), `release` (give up command), `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
