@@ -29,8 +29,8 @@ from membrane_ctrl.run_files.segments import FAULTS, panics_are_faults
 
 TIME = "run_time"
 COMPONENTS = ("Scalars:scalars", "Measurements:values", "Measurements:variances")
-# Address space: the library itself takes 1 GB; a segment of 0.7 GB, its columns and their copies three times as much.
-MEMORY_BYTES = 6_000_000_000
+# Address space beyond this program: a segment of 0.7 GB, its columns and their copies take three times as much.
+_MEMORY_BYTES = 3_000_000_000
 _IDLE_S = 60.0  # without a request for so long, the program ends
 _DIED = 1
 _FAULT_MOST = 200
@@ -73,7 +73,8 @@ def _serve_and_exit(request: dict[str, Any]) -> None:
     """In the fork: decode, answer, and end without the interpreter's clean-up."""
     try:
         signal.alarm(int(request["seconds"]))
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        most_bytes = _address_space_bytes() + _MEMORY_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
         path = Path(request["path"])
         try:
             parts: list[Part] = []
@@ -92,6 +93,11 @@ def _serve_and_exit(request: dict[str, Any]) -> None:
         os._exit(0)
     finally:
         os._exit(_DIED)
+
+
+def _address_space_bytes() -> int:
+    pages = Path("/proc/self/statm").read_text().split()[0]
+    return int(pages) * resource.getpagesize()
 
 
 def _reason(error: BaseException, path: Path) -> str:

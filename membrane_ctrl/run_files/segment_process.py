@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, NonNegativeInt, ValidationError
 
 from membrane_ctrl.model.arrays import Column, IntArray
 from membrane_ctrl.run_files.segments import require_bounded
@@ -28,6 +29,7 @@ _SPARE_S = 5.0  # the child ends itself first
 _HEAD_BYTES_MAX = 4_000_000
 _DATA_BYTES_MAX = 2_800_000_000  # four times what a segment may hold
 _READ_BYTES = 1 << 20
+_NONSENSE = "Rerun's reader gives no answer that makes sense"
 
 
 class SegmentCrashError(RuntimeError):
@@ -42,6 +44,15 @@ class SegmentPart:
     component: str
     times_ns: IntArray
     values: Column
+
+
+class _Head(BaseModel):
+    """The first line of an answer of the child."""
+
+    ok: bool
+    died: bool = False
+    fault: str = ""
+    parts: list[tuple[str, str, NonNegativeInt, NonNegativeInt]] = []
 
 
 def read_parts(path: Path, entities: set[str]) -> list[SegmentPart]:
@@ -95,9 +106,11 @@ class _Reader:
             except BaseException:  # an interrupt among them: what the child still sends belongs to no request
                 self.close()
                 raise
-        if not head["ok"]:
-            raise (SegmentCrashError if head["died"] else RuntimeError)(str(head["fault"]))
-        return _parts_of(head["parts"], data)
+        if head.died:
+            raise SegmentCrashError(head.fault)
+        if not head.ok:
+            raise RuntimeError(head.fault)
+        return _parts_of(head, data)
 
     def close(self) -> None:
         """End the child."""
@@ -112,7 +125,7 @@ class _Reader:
                 assert stream is not None
                 stream.close()
 
-    def _exchange(self, line: bytes, limit_s: float) -> tuple[dict[str, Any], bytearray]:
+    def _exchange(self, line: bytes, limit_s: float) -> tuple[_Head, bytearray]:
         until_s = time.monotonic() + limit_s + _SPARE_S
         for attempt in (1, 2):
             child = self._running()
@@ -142,17 +155,20 @@ class _Reader:
             )
         return self._child
 
-    def _read_answer(self, child: subprocess.Popen[bytes], until_s: float) -> tuple[dict[str, Any], bytearray]:
+    def _read_answer(self, child: subprocess.Popen[bytes], until_s: float) -> tuple[_Head, bytearray]:
         assert child.stdout is not None
         handle = child.stdout.fileno()
         received = bytearray()
         while (end := received.find(b"\n")) < 0:
             if len(received) > _HEAD_BYTES_MAX:
-                raise SegmentCrashError("Rerun's reader gives no answer that makes sense")
+                raise SegmentCrashError(_NONSENSE)
             received += _received(handle, until_s)
-        head = json.loads(received[:end])
+        try:
+            head = _Head.model_validate_json(received[:end])
+        except ValidationError:
+            raise SegmentCrashError(_NONSENSE) from None
         del received[: end + 1]
-        size = sum(8 * rows * (1 + width) for _, _, rows, width in head.get("parts", ()))
+        size = sum(8 * rows * (1 + width) for _, _, rows, width in head.parts)
         if size > _DATA_BYTES_MAX:
             raise SegmentCrashError(f"{size / 1e6:.0f} MB of numbers in it, which no recorder writes")
         while len(received) < size:
@@ -171,9 +187,9 @@ def _received(handle: int, until_s: float) -> bytes:
     return data
 
 
-def _parts_of(heads: list[Any], data: bytearray) -> list[SegmentPart]:
+def _parts_of(head: _Head, data: bytearray) -> list[SegmentPart]:
     parts, place = [], 0
-    for entity, component, rows, width in heads:
+    for entity, component, rows, width in head.parts:
         times_ns = np.frombuffer(data, np.int64, rows, place).copy()
         place += times_ns.nbytes
         values = np.frombuffer(data, np.float64, rows * width, place).reshape(rows, width).copy()

@@ -162,7 +162,7 @@ _OWN = {
     "run_files/latched_fault.py", "commissioning/safe.py", "run_files/disk_budget.py", "control_port/sockets.py",
     "sessions/folder.py", "sessions/live_log.py", "web/panels.py",
     # a new folder, a temporary one, or a file that the user has named
-    "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
+    "sim/optics/simulate.py", "replay/command.py", "run_files/segment_salvage.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "calibration/report.py", "geometry/spread_file.py", "commissioning/devices.py",
     # the project's own pages
