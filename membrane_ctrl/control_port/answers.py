@@ -10,7 +10,6 @@ Messages stay dictionaries with the keys that were sent.
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Annotated, Any, Literal
 
@@ -174,7 +173,7 @@ class EventPart(_Part):
     mono_s: _Number | None = None
 
 
-class Greeting(_Part):
+class GreetingPart(_Part):
     """The first message of a hold."""
 
     membrane_ctrl: Annotated[int, Field(strict=True, ge=1)]
@@ -184,7 +183,7 @@ class Greeting(_Part):
     commander: _Text | None = None
 
 
-class Answer(_Part):
+class AnswerPart(_Part):
     """The answer to a request."""
 
     number: _Count
@@ -196,14 +195,14 @@ class Answer(_Part):
     pump: dict[str, Any] | None = None
 
 
-class Streamed(_Part):
+class StreamedPart(_Part):
     """A message of `watch`."""
 
     status: StatusPart | None = None
     event: EventPart | None = None
 
 
-class Notice(_Part):
+class NoticePart(_Part):
     """A message for the person at the client; a `code` makes it one for the program as well."""
 
     notice: _Text
@@ -226,7 +225,12 @@ def kind_of(message: Message) -> Kind:
     return "unknown"
 
 
-_MODELS: dict[Kind, type[_Part]] = {"answer": Answer, "notice": Notice, "streamed": Streamed, "unknown": _Part}
+_MODELS: dict[Kind, type[_Part]] = {
+    "answer": AnswerPart,
+    "notice": NoticePart,
+    "streamed": StreamedPart,
+    "unknown": _Part,
+}
 
 
 def check_message(message: Message) -> Message:
@@ -238,7 +242,7 @@ def check_greeting(message: Message) -> Message:
     """Return a greeting, checked. Raises AnswerError."""
     if "membrane_ctrl" not in message:
         raise AnswerError("not a control port of membrane-ctrl")
-    return check(message, Greeting)
+    return check(message, GreetingPart)
 
 
 def check(message: Message, model: type[BaseModel]) -> Message:
@@ -255,8 +259,3 @@ def _described(error: ValidationError) -> str:
     field = ".".join(str(part) for part in first["loc"])
     problem = "missing" if first["type"] == "missing" else first["msg"][:1].lower() + first["msg"][1:]
     return terminal.one_line(f"{field[:_QUOTED_MAX]}: {problem}"[: 2 * _QUOTED_MAX])
-
-
-def compact(message: Message) -> str:
-    """JSON text of a message, for programs."""
-    return json.dumps(message, allow_nan=False)

@@ -315,6 +315,7 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
             entry.configuration,
             f"{entry.size_mb:.1f}",
             one_line(entry.exit)
+            + (f" ({one_line(entry.ended_in)})" if entry.ended_in else "")
             + (f", {entry.marks} marked" if entry.marks else "")
             + (", kept" if entry.kept else ""),
         )

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 
 # Statistics of a run of any length in constant memory.
 
@@ -172,6 +173,7 @@ class Summary:
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
         self._faults: list[EventLine] = []
+        self._standing_fault: events.Fault | None = None
         self._fault_count = 0
         self._geometry: EventLine = {}
         self._end: EventLine = {}
@@ -205,7 +207,9 @@ class Summary:
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
 
     def add_event(self, event: EventLine) -> None:
-        """Add one event; only "fault", "geometry" and "end" matter."""
+        """Add one event; only those of faults and states, "geometry" and "end" matter."""
+        if event.get("kind") in ("fault", "cleared", "state"):
+            self._standing_fault = standing_fault_after(self._standing_fault, run_events.from_dict(event))
         if event.get("kind") == "fault":
             self._fault_count += 1
             if len(self._faults) < _LISTED_MAX:
@@ -233,6 +237,7 @@ class Summary:
         """
         true, means = self._true_um, self._true_1s_um.result()
         held = means if means["seconds"] else self._reading_1s_um.result()
+        fault = fault_of_end(self._standing_fault, self._end.get("exit"))
         return {
             "schema": SCHEMA,
             "exit": self._end.get("exit"),
@@ -259,6 +264,7 @@ class Summary:
             "transitions": self._transitions,
             "faults": self._faults,
             "fault_count": self._fault_count,
+            "ended_in": None if fault is None else fault.to_dict(),
             "dropped": dropped,
             "recorder": recorder,
             "end": self._end,
