@@ -173,7 +173,7 @@ class Summary:
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
         self._faults: list[EventLine] = []
-        self._standing_fault: events.Fault | None = None
+        self._standing: list[EventLine] = []  # the fault that stands, if one does; plain data, for the state file
         self._fault_count = 0
         self._geometry: EventLine = {}
         self._end: EventLine = {}
@@ -209,7 +209,8 @@ class Summary:
     def add_event(self, event: EventLine) -> None:
         """Add one event; only those of faults and states, "geometry" and "end" matter."""
         if event.get("kind") in ("fault", "cleared", "state"):
-            self._standing_fault = standing_fault_after(self._standing_fault, run_events.from_dict(event))
+            standing = standing_fault_after(self._standing_fault(), run_events.from_dict(event))
+            self._standing = [] if standing is None else [standing.to_dict()]
         if event.get("kind") == "fault":
             self._fault_count += 1
             if len(self._faults) < _LISTED_MAX:
@@ -218,6 +219,13 @@ class Summary:
             self._geometry = {key: event.get(key) for key in ("hash", "file", "calibrated_utc")}
         elif event.get("kind") == "end":
             self._end = event
+
+    def _standing_fault(self) -> events.Fault | None:
+        for line in self._standing:
+            event = run_events.from_dict(line)
+            if isinstance(event, events.Fault):
+                return event
+        return None
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle."""
@@ -237,7 +245,7 @@ class Summary:
         """
         true, means = self._true_um, self._true_1s_um.result()
         held = means if means["seconds"] else self._reading_1s_um.result()
-        fault = fault_of_end(self._standing_fault, self._end.get("exit"))
+        fault = fault_of_end(self._standing_fault(), self._end.get("exit"))
         return {
             "schema": SCHEMA,
             "exit": self._end.get("exit"),
