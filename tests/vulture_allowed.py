@@ -24,3 +24,7 @@ _.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
 _.screen_x_mm, _.screen_y_mm, _.screen_turn_x_deg, _.screen_turn_y_deg, _.screen_turn_z_deg  # sigmas, read by name
 _.camera_yaw_deg, _.camera_pitch_deg, _.camera_roll_deg, _.focal_relative, _.k1, _.k2, _.p1, _.p2, _.pitch_relative
 pump_map  # of an event of runs of earlier versions
+# fields of a hold's messages: declared to be checked, and read by their keys
+_.state, _.why, _.run, _.fault, _.row, _.maintenance, _.recording, _.gains, _.geometry, _.safe_level, _.shape
+_.shape_reason, _.state_age_s, _.trial_left_s, _.commander, _.command_session, _.clients, _.mono_s, _.refused
+_.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _.since_utc, _.kp_per_s, _.ti_s, _.td_s
