@@ -75,7 +75,7 @@ def opened(
 ) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
     """Yield a session's folder and hold; restore the last good gains if it ends early, and say how to go on."""
     progress = Progress()
-    with linked(options) as link:
+    with linked(options, f"tune {options.name}") as link:
         if refused := refusal(link.config):
             raise InputError(refused)
         folder = folder_of(options, link, fresh)
@@ -108,9 +108,10 @@ def _go_back(rig: HoldRig, progress: Progress) -> None:
     progress.say("holding the mirror with the last good gains")
 
 
-def linked(options: TuneOptions) -> contextlib.AbstractContextManager[HoldLink]:
+def linked(options: TuneOptions, session: str = "") -> contextlib.AbstractContextManager[HoldLink]:
+    """Connect to the hold; with the name of a `session`, claim its command."""
     if not options.twin:
-        return live_hold(options.where, options.take_over, wait=options.wait)
+        return live_hold(options.where, options.take_over, wait=options.wait, session=session)
     config = open_session(options.session).config if options.session is not None else options.config
     try:
         return contextlib.closing(TwinHold(config))

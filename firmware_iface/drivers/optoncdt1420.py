@@ -30,6 +30,7 @@ _PROMPT = b"->"
 _ERROR = re.compile(r"E(\d{3})([^\r\n]*)")
 _RATE = re.compile(r"(\d+(?:\.\d*)?)(?: ?kHz)?")
 _MIDDLE_MIN = 8  # the median for fewer values
+_HEARD_BYTES_MAX = 65_536  # of the answer to a command, and of a stream that stops before it
 _BATCHES_MAX = 1024  # without a caller; old ones are dropped first
 _SILENT_MAX = 3  # readings without a single value: the sensor restarted or lost its power
 _BYTES = 6  # a measurement
@@ -255,7 +256,7 @@ class Optoncdt1420:
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
         if self._heard is not None:
-            self._heard += data
+            self._heard = (self._heard + data)[-_HEARD_BYTES_MAX:]
         elif len(batch := self._parser.feed(data)):
             self._counted += len(batch)
             self._arrived_s = asyncio.get_running_loop().time()

@@ -201,6 +201,7 @@ class _Connection(asyncio.Protocol):
 # Any Modbus device as an RTU slave on an emulated serial line, alone or with others on the same bus.
 
 _SHORTEST = 4  # unit, function, CRC
+_LONGEST = 256  # of a frame; bytes without a silence between them never end otherwise
 _SILENCE_S = 0.005  # far above the 1.75 ms of the standard: a program's bytes may be held up between two reads
 DIAGNOSTICS = 8
 
@@ -226,7 +227,7 @@ class RtuBusEmulator(SerialDevice):
         now_s = asyncio.get_running_loop().time()
         self._heard = data if now_s - self._heard_s > _SILENCE_S else self._heard + data
         self._heard_s = now_s
-        frame = self._heard
+        frame = self._heard = self._heard[-_LONGEST:]
         if len(frame) < _SHORTEST or struct.unpack("<H", frame[-2:])[0] != bitwise_crc(frame[:-2]):
             return
         self._heard = b""

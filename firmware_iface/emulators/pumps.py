@@ -217,6 +217,9 @@ class BronkhorstRegisters:
         raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
 
 
+_HEARD_BYTES_MAX = 4096  # of messages that have not ended
+
+
 class ProparDevice(serial_device.SerialDevice):
     """The instrument on a serial line; answers in the form of the question, binary or ASCII."""
 
@@ -233,7 +236,7 @@ class ProparDevice(serial_device.SerialDevice):
 
     def received(self, data: bytes) -> None:
         """Answer every whole message."""
-        self._heard += data
+        self._heard = (self._heard + data)[-_HEARD_BYTES_MAX:]
         if b"\x10\x02" in self._heard:
             messages, self._heard = bronkhorst_propar.split_binary(self._heard)
             for message in messages:

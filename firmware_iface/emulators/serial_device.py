@@ -79,6 +79,9 @@ class SerialDevice:
         self._due.add(timer)
 
 
+_LINE_BYTES_MAX = 1024  # of a line that has not ended
+
+
 class LineDevice(SerialDevice):
     """A device that answers lines of text; a device overrides `line`."""
 
@@ -93,6 +96,7 @@ class LineDevice(SerialDevice):
         *lines, self._heard = (self._heard + data).split(self.end)
         for line in lines:
             self.line(line.strip().decode("ascii", "replace"))
+        self._heard = self._heard[-_LINE_BYTES_MAX:]
 
     def restart(self) -> None:
         """Half a line is forgotten."""

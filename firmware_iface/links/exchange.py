@@ -24,6 +24,8 @@ _SHOWN_BYTES = 24
 # after this many questions without a valid answer the line is closed: its owner then reopens it, which also applies
 # the settings that a device loses with its power
 _FAILURES_MAX = 5
+# bytes beyond the longest answer: noise before it; a device that sends without end must not fill the memory
+_EXTRA_BYTES_MAX = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,7 @@ class SerialExchange:
         self._last_byte_s = 0.0
         self._heard = b""
         self._take: Callable[[bytes], bytes | None] | None = None
+        self._answer_bytes = 0
         self._answer: asyncio.Future[bytes] | None = None
 
     def connect(self, greeting: bytes = b"") -> None:
@@ -141,6 +144,7 @@ class SerialExchange:
         self._require_open(question.what)
         self.port.write(question.data)
         self._heard, self._take = b"", question.take
+        self._answer_bytes = question.answer_bytes
         answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._answer = answer
         wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
@@ -170,6 +174,9 @@ class SerialExchange:
             self._noisy |= bool(data.strip(self._blank))  # unsolicited
             return
         self._heard += data
+        if len(self._heard) > self._answer_bytes + _EXTRA_BYTES_MAX:
+            self._answer.set_exception(LinkError(f"{self.port.name}: {len(self._heard)} bytes without an answer"))
+            return
         try:
             answer = self._take(self._heard)
         except LinkError as error:

@@ -112,6 +112,9 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 # a peer that lost its power does not close the connection: after this many unanswered requests in a row, and one more
 # that finds the count exhausted, the connection is abandoned (the count is the library's)
 _UNANSWERED_MAX = 3
+# Bytes from the device for one request: a reply has 260 at most, and late ones of earlier requests may precede it.
+# A peer that sends without end would keep the library, and so the control process, busy for seconds.
+_REPLY_BYTES_MAX = 1024
 
 
 class GuardedModbusTcp:
@@ -131,6 +134,7 @@ class GuardedModbusTcp:
         self._turn = asyncio.Lock()  # released when the request ends, whatever happens to its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
+        self._received_bytes = 0  # since the last request was sent
 
     @property
     def name(self) -> str:
@@ -166,6 +170,22 @@ class GuardedModbusTcp:
             client.close()
             raise LinkDownError(f"{self.name}: no connection; is the device on, and is this its address?")
         self._client = client
+        self._bound_replies(client)
+
+    def _bound_replies(self, client: AsyncModbusTcpClient) -> None:
+        """Give up the connection to a peer that sends more than a device does, before the library reads it."""
+        read = client.ctx.data_received
+        self._received_bytes = 0
+
+        def read_if_bounded(data: bytes) -> None:
+            self._received_bytes += len(data)
+            if self._received_bytes <= _REPLY_BYTES_MAX:
+                read(data)
+                return
+            _fail_in_flight(client, f"{self.name}: sends more than an answer; connection given up")
+            client.close()
+
+        client.ctx.data_received = read_if_bounded  # type: ignore[method-assign]
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).
@@ -267,6 +287,7 @@ class GuardedModbusTcp:
         client = self._client
         if client is None or not client.connected:
             raise LinkDownError(f"{what}: not connected")
+        self._received_bytes = 0
         try:
             reply = await send(client)
         except ConnectionException as error:

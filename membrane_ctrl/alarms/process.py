@@ -6,7 +6,6 @@ Notices go through Apprise: mail, chat, web hook and many more, each a URL (http
 import importlib
 import importlib.util
 import json
-import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
+from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
 from membrane_ctrl.config import schema
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model import errors, files, run_events
@@ -106,35 +106,23 @@ def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
     apprise = _apprise()
     assert config.urls_file is not None
     lists = [name for name in (config.urls_file, config.escalation_urls_file) if name is not None]
-    return [partial(_send, _plugins(apprise, Path(name)), run) for name in lists]
+    return [partial(_send, _services(apprise, Path(name)), run) for name in lists]
 
 
-def _send(targets: Sequence[Any], run: str, notice: Notice) -> bool:
+def _send(targets: Sequence[Service], run: str, notice: Notice) -> bool:
     kind = _TYPES[notice.kind] or {"warning": "warning", "critical": "failure"}[notice.severity]
     title = f"membrane-ctrl {notice.severity} {notice.kind}: {notice.name}"
-    return _notify(targets, title, f"{notice.text}\nrun: {run}", kind)
+    return send_to_all(targets, title, f"{notice.text}\nrun: {run}", kind)
 
 
-def _notify(targets: Sequence[Any], title: str, body: str, kind: str) -> bool:
-    """Notify every target; one success suffices: a dead chat server must not repeat the mail forever."""
-    sent = []
-    for target in targets:
-        try:
-            sent.append(bool(target.notify(title=title, body=body, notify_type=kind)))
-        except Exception as error:  # plug-ins raise anything
-            logging.getLogger(__name__).warning("%s: %s", type(target).__name__, type(error).__name__)
-            sent.append(False)
-    return any(sent)
-
-
-def _plugins(apprise: Any, path: Path) -> list[Any]:
-    plugins = []
+def _services(apprise: Any, path: Path) -> list[Service]:
+    services = []
     for number, url in enumerate(read_urls(path), start=1):
         plugin = apprise.Apprise.instantiate(url)
         if plugin is None:
             raise errors.InputError(f"{path}: URL {number}: Apprise does not support it")
-        plugins.append(plugin)
-    return plugins
+        services.append(Service(plugin))
+    return services
 
 
 def _apprise() -> Any:
@@ -157,7 +145,8 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
     notice = Notice("raised", "test", "warning", "this is only a test", escalated)
     senders = apprise_senders(alarms, "none, a test")
     lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
-    deaf = [file for file, send in zip(lists, senders, strict=False) if not send(notice)]
+    with limited_memory():
+        deaf = [file for file, send in zip(lists, senders, strict=False) if not send(notice)]
     if as_json:
         print(json.dumps({"sent": not deaf}))
     if deaf:
@@ -263,7 +252,9 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     Target of a `spawn`ed process; `status` is its end of a pipe, for events about sent notices.
     """
     child.leave_at_stop()
-    watch(spec, apprise_senders(spec.config, spec.run), child.reporter(status), child.parent_lives)
+    senders = apprise_senders(spec.config, spec.run)
+    with limited_memory():
+        watch(spec, senders, child.reporter(status), child.parent_lives)
 
 
 def watch(

@@ -51,7 +51,9 @@ def calibrate_live(options: LiveOptions) -> int:
             raise InputError("--session has its own setpoints: omit --range-um and --sets")
         session = sessions.resume(options.session)
     if session is None or session.missing:
-        with live_hold(options.where, options.take_over, "calibrate --live") as link:
+        with live_hold(
+            options.where, options.take_over, "calibrate --live", session=f"calibrate {options.name}"
+        ) as link:
             session = take_sets(link, session, options)
     return solve_and_adopt(session, options)
 

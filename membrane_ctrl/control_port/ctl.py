@@ -12,11 +12,14 @@ from typing import Any
 from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
 from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
-from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.client import ANSWER_S, PortClient
+from membrane_ctrl.control_port.commander import CommandSession
 from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
 from membrane_ctrl.model.lock import Lock, describe_lock
 
 _LOCK_FIELDS = tuple(field.name for field in fields(Lock))
+
+_FLEET_S = 10.0  # for all holds of a fleet, which are asked at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +91,13 @@ def fleet_status(file: Path, as_json: bool) -> int:
 
 def _status_of(where: Where) -> dict[str, Any]:
     try:
-        with connected(where, notice=lambda _: None) as client:
+        with connected(where, notice=lambda _: None, answer_s=_FLEET_S / 2) as client:
+            client.patience(_FLEET_S / 2)
             answer = client.ask(do="status")
     except errors.CommandError as error:
         return {"problem": "; ".join(error.lines)}
+    except Exception as error:  # whatever one hold causes, the others are listed
+        return {"problem": f"{type(error).__name__}: {error}"}
     return dict(answer["status"]) if answer.get("ok") else {"problem": str(answer.get("refused"))}
 
 
@@ -153,19 +159,32 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
         if gains := status.get("gains"):
             lines.append(f"  {'gains':15}{telemetry.gains_words(gains, status.get('trial_left_s'))}")
-        lines.append(f"  {'shape loop':15}{status['shape']} {status['shape_reason']}".rstrip())
+        shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
+        lines.append(f"  {'shape loop':15}{shape}".rstrip())
         lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
     lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
     lines += [f"  {'recording':15}{message}" for message in status.get("recording", {}).values()]
-    lines.append(f"  {'commander':15}{status.get('commander') or 'nobody'}")
+    lines.append(f"  {'commander':15}{_commander(status)}")
     return lines
+
+
+def _commander(status: dict[str, Any]) -> str:
+    session = status.get("command_session")
+    if session is None:
+        return str(status.get("commander") or "nobody")
+    known = {key: session.get(key) for key in ("id", "who", "what", "pid", "since_utc")}
+    return CommandSession(**known).describe()
 
 
 def _geometry(geometry: dict[str, Any] | None) -> str:
     if geometry is None:
         return "not in use yet"
-    made = f"{geometry['file']}, calibrated {geometry['calibrated_utc']}" if geometry["file"] else "as configured"
-    return geometry["message"] or f"{made} (hash {geometry['hash']})"
+    if geometry.get("message"):
+        return str(geometry["message"])
+    made = "as configured"
+    if geometry.get("file"):
+        made = f"{geometry['file']}, calibrated {geometry.get('calibrated_utc')}"
+    return f"{made} (hash {geometry.get('hash')})"
 
 
 def _watch(client: PortClient, first: dict[str, Any], period_s: float, as_json: bool) -> int:
@@ -220,29 +239,31 @@ def _printed(text: str) -> None:
     print(f"notice: {text}", file=sys.stderr)
 
 
-def connected(where: Where, notice: Callable[[str], None] = _printed) -> PortClient:
-    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no hold answers."""
+def connected(where: Where, notice: Callable[[str], None] = _printed, answer_s: float = ANSWER_S) -> PortClient:
+    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no hold answers.
+
+    Connection and greeting take `answer_s` at most.
+    """
     if where.tls:
-        return _connect_tls(where, notice)
+        return _connect_tls(where, notice, answer_s)
     path = socket_path(where)
     if where.socket is None and where.run is None and not path.exists():
         raise errors.DeviceError(f"{path}: no hold is listening; name its run with --run or --socket")
-    client = PortClient.unix(path, notice)
+    client = PortClient.unix(path, notice, answer_s)
     if where.run is not None and client.greeting["run"] != where.run.resolve().name:
         client.close()
         raise errors.InputError(f"{where.run}: is not running; {client.greeting['run']} is")
     return client
 
 
-def _connect_tls(where: Where, notice: Callable[[str], None]) -> PortClient:
+def _connect_tls(where: Where, notice: Callable[[str], None], answer_s: float) -> PortClient:
     host, _, port = where.tls.rpartition(":")
     if not host or not port.isdigit():
         raise errors.InputError(f"--tls {where.tls}: expected HOST:PORT")
     if where.certificate is None or where.key is None or where.authority is None:
         raise errors.InputError("--tls needs --certificate, --key and --authority")
-    return PortClient.tls(
-        host, int(port), sockets.client_context(where.certificate, where.key, where.authority), notice
-    )
+    context = sockets.client_context(where.certificate, where.key, where.authority)
+    return PortClient.tls(host, int(port), context, notice, answer_s)
 
 
 def socket_path(where: Where) -> Path:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import socket
 import ssl
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
@@ -29,7 +28,7 @@ MESSAGE_BYTES = 8192
 # who, why and text go into one event, and JSON makes up to 3 bytes of one in UTF-8: together they fit its slot
 WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
-Errand = Literal["status", "watch", "release", "quiet"]
+Errand = Literal["status", "watch", "release", "quiet", "claim"]
 Action = Literal[Kind, Errand]
 
 
@@ -68,16 +67,20 @@ class OnBehalf(Section):
     role: Role
 
 
+_ERRAND_NEEDS: dict[str, tuple[str, ...]] = {"claim": ("text",)}
+
+
 class Request(Section):
     """A client's request."""
 
     number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
-    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `release` (give up command),
-    # `quiet` (acknowledge the alarms)
+    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command for a session,
+    # this connection), `release` (give up command), `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
-    # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a person typed
+    # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a person typed. `claim`:
+    # the session's name
     text: Annotated[str, _words(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
@@ -98,7 +101,7 @@ class Request(Section):
     @model_validator(mode="after")
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
-        needs, takes = (rule.needs, rule.takes) if rule else ((), ())
+        needs, takes = (rule.needs, rule.takes) if rule else (_ERRAND_NEEDS.get(self.do, ()), ())
         for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s", "setpoint_step_um"):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
@@ -238,7 +241,9 @@ class Wire:
 
 
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
-_ERRANDS: dict[str, Role] = {"status": "read", "watch": "read", "release": "operate", "quiet": "operate"}
+_ERRANDS: dict[str, Role] = {
+    "status": "read", "watch": "read", "claim": "operate", "release": "operate", "quiet": "operate",
+}  # fmt: skip
 
 # These need no command: what makes the mirror safe is always accepted, and the others move nothing
 FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SAFETY
@@ -250,8 +255,13 @@ class Peer:
 
     who: str
     role: Role
-    session: str = ""  # what identifies the connection
+    pid: int | None = field(default=None, compare=False)  # of its process, if it is on this machine
     is_own_user: bool = False  # a process of the hold's own user on the socket file
+
+    @property
+    def session(self) -> str:
+        """What identifies the sender of a lock for people: its process; empty if that is unknown."""
+        return "" if self.pid is None else f"process {self.pid}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,29 +306,3 @@ def may_not(sender: Peer | Sender, do: Action) -> str:
     if _RANK[sender.role] >= _RANK[needed]:
         return ""
     return f"{do} needs the role {needed}; {sender.who} has {sender.role}"
-
-
-class Commander:
-    """One commander at a time: the first client to command, until it releases or loses command or idles too long."""
-
-    def __init__(self, lapses_s: float) -> None:
-        self._lapses_s = lapses_s
-        self._holder = ""
-        self._last_s = -math.inf
-
-    def holder(self, now_s: float) -> str:
-        """Who has command; empty if nobody."""
-        return self._holder if now_s - self._last_s <= self._lapses_s else ""
-
-    def claim(self, who: str, take_over: bool, now_s: float) -> str:
-        """Take or keep command; returns why not, or an empty text."""
-        holder = self.holder(now_s)
-        if holder not in ("", who) and not take_over:
-            return f"{holder} has command; take over with --take-over, or wait for its release"
-        self._holder, self._last_s = who, now_s
-        return ""
-
-    def release(self, who: str) -> None:
-        """Release command, if `who` has it."""
-        if self._holder == who:
-            self._holder = ""

@@ -18,8 +18,9 @@ from typing import Any
 from membrane_ctrl.config import port, schema, toml_file
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
+from membrane_ctrl.control_port.commander import Commander, CommandSession
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome
-from membrane_ctrl.control_port.protocol import FREE, Commander, Peer, Sender, may_not
+from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, may_not
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.session import PortSession
@@ -115,11 +116,13 @@ class Port:
 
     def status(self) -> dict[str, Any]:
         """The status for `status` and `watch`."""
+        session = self._commander.session
         return {
             "run": self._run,
             **status_table(self._status),
             "gains": self._hooks.loop().model_dump(include={"kp_per_s", "ti_s", "td_s"}),
             "commander": self._commander.holder(self._now()) or None,
+            "command_session": None if session is None else session.to_dict(),
             "clients": len(self._sessions),
         }
 
@@ -167,6 +170,8 @@ class Port:
             await session.run(greeting, self._answer, self._refusals.record)
         finally:
             self._sessions.remove(session)
+            if (ended := self._commander.end_session(session.id)) is not None:
+                self._tell(run_events.CommanderChanged(None, ended.describe(), "its connection is closed"))
             if expiry is not None:
                 expiry.cancel()
 
@@ -177,14 +182,17 @@ class Port:
     def _make_room(self, peer: Peer) -> None:
         own = [session for session in self._sessions if session.peer.who == peer.who]
         crowd = own if len(own) >= _SESSIONS_EACH else self._sessions if len(self._sessions) >= _SESSIONS_MOST else []
-        if crowd:
-            self._turn_out(min(crowd, key=lambda session: session.heard_s), "too many connections: silent longest")
+        # a session that has command is silent while its experiment runs; there is one at most
+        in_command = self._commander.session
+        idle = [each for each in crowd if in_command is None or each.id != in_command.id]
+        if idle:
+            self._turn_out(min(idle, key=lambda session: session.heard_s), "too many connections: silent longest")
 
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
         sender = protocol.sender_of(peer, request.on_behalf)
-        refusal = may_not(sender, request.do) or self._expired(request) or self._claim_command(peer, request)
+        refusal = may_not(sender, request.do) or self._expired(request) or self._claim_command(session, request)
         if not refusal and is_safety_command(request.do):
             for other in self._sessions:
                 other.refuse_waiting(request.do)
@@ -225,26 +233,39 @@ class Port:
             return ""
         return f"{request.do} came {self._now() - request.expires_s:.1f} s after its time limit; send again"
 
-    def _claim_command(self, peer: Peer, request: protocol.Request) -> str:
+    def _claim_command(self, session: PortSession, request: protocol.Request) -> str:
+        """Give command to a client that needs it; returns why not, or an empty text."""
         if request.do in FREE:
             return ""
-        former = self._commander.holder(self._now())
-        refusal = self._commander.claim(peer.who, request.take_over, self._now())
-        if not refusal and former != peer.who:
-            self._tell(run_events.CommanderChanged(peer.who, former or None, request.why))
-            for session in self._sessions:
-                if session.peer.who == former:
-                    session.notice(f"{peer.who} has taken over command" + (f": {request.why}" * bool(request.why)))
-        return refusal
+        who, now_s = session.peer.who, self._now()
+        former, former_session = self._commander.holder(now_s), self._commander.session
+        take_over = request.take_over
+        if request.do == "claim":
+            since_utc = datetime.now(UTC).isoformat(timespec="seconds")
+            begun = CommandSession(session.id, who, request.text, session.peer.pid, since_utc)
+            refusal = self._commander.begin_session(begun, take_over, now_s)
+        else:
+            refusal = self._commander.claim(who, take_over, now_s, session.id)
+        present = self._commander.session
+        if refusal or (former == who and former_session is present):
+            return refusal
+        name = who if present is None else present.describe()
+        former_name = former if former_session is None else former_session.describe()
+        self._tell(run_events.CommanderChanged(name, former_name or None, request.why))
+        reason = f": {request.why}" if request.why else ""
+        for other in self._sessions:
+            of_session = former_session is not None and other.id == former_session.id
+            of_name = former_session is None and former != who and other.peer.who == former
+            if of_session or of_name:
+                other.command_taken(f"{name} has taken over command{reason}")
+        return ""
 
     def _run_errand(self, session: PortSession, sender: Sender, request: protocol.Request) -> dict[str, Any]:
-        who = session.peer.who
         match request.do:
             case "watch":
                 session.watch(request.period_s)
             case "release":
-                self._commander.release(who)
-                self._tell(run_events.CommanderChanged(None, who, request.why))
+                self._release_command(session, request.why)
             case "quiet":
                 self._tell(run_events.AlarmsAcknowledged(sender.who, request.why))
         return {
@@ -253,6 +274,14 @@ class Port:
             "loop": self._hooks.loop().model_dump(),
             "pump": self._hooks.pump().model_dump(),
         }
+
+    def _release_command(self, session: PortSession, why: str) -> None:
+        who, in_command = session.peer.who, self._commander.session
+        if in_command is not None and in_command.id != session.id:
+            return  # another session's
+        self._commander.release(who, session.id)
+        former = who if in_command is None else in_command.describe()
+        self._tell(run_events.CommanderChanged(None, former, why))
 
     def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for invalid gains or an invalid experiment."""

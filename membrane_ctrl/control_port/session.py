@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from membrane_ctrl.control_port.answers import COMMAND_TAKEN
 from membrane_ctrl.control_port.protocol import Peer, Request, RequestError, SlowReaderError, Wire
 from membrane_ctrl.control_port.request_intake import ReadingTurns, RequestIntake
 from membrane_ctrl.model.events import Event
@@ -20,6 +22,7 @@ class PortSession:
 
     def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]], turns: ReadingTurns) -> None:
         self.peer = peer
+        self.id = secrets.token_hex(4)  # of the connection
         self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
         self._wire = wire
         self._status = status
@@ -67,6 +70,11 @@ class PortSession:
         """Send an unsolicited notice."""
         with contextlib.suppress(SlowReaderError):
             self._wire.send({"notice": text})
+
+    def command_taken(self, text: str) -> None:
+        """Send the notice that this connection has lost command to another."""
+        with contextlib.suppress(SlowReaderError):
+            self._wire.send({"notice": text, "code": COMMAND_TAKEN})
 
     def event(self, event: Event) -> None:
         """Send an event to a watching peer."""

@@ -58,7 +58,7 @@ class UnixListener:
         pid, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
         who = f"unix:{self._names.get(uid, uid)}"
-        return protocol.Peer(who, role, session=f"process {pid}", is_own_user=uid == os.getuid())
+        return protocol.Peer(who, role, pid or None, is_own_user=uid == os.getuid())  # pid 0: in another container
 
     def close(self) -> None:
         """Close it and remove the file, unless replaced by another; remove an empty folder made for it."""

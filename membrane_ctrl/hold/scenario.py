@@ -19,10 +19,11 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.console import process, why
 from membrane_ctrl.controller import tick
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.hold import scenario, scenarios, start
+from membrane_ctrl.hold import scenario, scenarios
+from membrane_ctrl.hold.closing_words import Closing, report
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model import clock, errors, run_events, telemetry, terminal
+from membrane_ctrl.model import clock, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -131,7 +132,7 @@ class ScenarioRun:
 
     def __init__(self, scenario: Scenario, rings: Rings | None = None) -> None:
         self.config = config = scenario.config
-        self.stopped = False  # before its end
+        self.closing = Closing()
         steps = sorted(scenario.at, key=lambda at: at.time_s)
         mirror = plant.Plant(
             config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE)
@@ -159,11 +160,15 @@ class ScenarioRun:
                     commands.append(due)
                 else:
                     due(self.bench)
-            yield run.tick(tuple(commands))
+            tick = run.tick(tuple(commands))
+            if tick is not None:
+                self.closing.heard(tick.outputs)
+            yield tick
+        self.closing.exit = run.exit
 
     def stop(self, who: str) -> None:
         """End the run now."""
-        self.stopped, self._ends_s = True, self.virtual.now_s
+        self._ends_s = self.virtual.now_s
         self._agenda = deque([(0.0, Command("stop", who))])
 
 
@@ -235,8 +240,8 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
             ticks = terminal.counted(ticks, "playing", round(played.duration_s * config.loop.rate_hz))
         with _stopped_by_signals(run):
             _record(run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S)
-    start.report(run_dir, as_json=False)
-    return errors.Exit.INTERRUPTED if run.stopped else errors.Exit.DONE
+    report(run_dir, as_json=False, closing=run.closing)
+    return run.virtual.exit
 
 
 def _sizes(config: schema.Config) -> dict[str, tuple[int, int]]:

@@ -8,9 +8,6 @@ import asyncio
 import contextlib
 import gc
 import importlib.util
-import json
-import math
-import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -23,12 +20,13 @@ from firmware_iface.drivers.pump_board import NO_CLAIM
 from firmware_iface.roles import ALL_FAULTS, Bench, BenchReading, LinkError
 from firmware_iface.settings import GpioLineConfig
 from membrane_ctrl.alarms.process import require_sendable
-from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import commands, cross_check, interlocks, safe_levels, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.hold import child_processes
+from membrane_ctrl.hold.closing_words import Closing, report
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
@@ -112,13 +110,20 @@ def hold_mirror(options: HoldOptions) -> int:
         port = partial(server.Port, config.port, listeners, run_dir.name)
         latch = partial(FaultLatch, latched, resumes, run_dir.name, clock.utc)
         keeper = partial(LockKeeper, lock_storage)
-        exit_code = asyncio.run(
-            _run(bench, config, options, clock, rings, children, twin, port, latch, board, keeper)
-        )
-        children.take_down()
+        closing = Closing()
+        try:
+            asyncio.run(
+                _run(bench, config, options, clock, rings, children, twin, port, latch, board, closing, keeper)
+            )
+            children.take_down()
+        except KeyboardInterrupt:
+            if closing.exit is None:
+                raise
+            # the run had ended before: its own end counts
+    assert closing.exit is not None
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
-        report(run_dir, options.json)
-    return exit_code
+        report(run_dir, options.json, closing)
+    return closing.exit
 
 
 def _require_possible(devices: DevicesConfig, lab: bool) -> None:
@@ -257,10 +262,12 @@ async def _run(
     port_for: Callable[[server.RunHooks], server.Port],
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
+    closing: Closing,
     keeper_for: Callable[[Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper] = (
         _STORES_NONE
     ),
-) -> errors.Exit:
+) -> None:
+    """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
     from membrane_ctrl.metrology.optics.film_law import zernike_projection
 
     assert config.devices is not None
@@ -279,6 +286,7 @@ async def _run(
             "latched-fault file": latch.heard,
             "systemd": systemd.heard,
             "capture": partial(_capture, children, supervisor.tell),
+            "closing words": closing.heard,
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
         supervisor.tell(run_events.Started(config.devices.name, child.raise_priority(), board.cleared))
@@ -292,7 +300,10 @@ async def _run(
                     # last: the board's watchdog runs from here on
                     if (await connect(bench, config.devices)).map_version == 1:
                         supervisor.tell(run_events.NoClaim(NO_CLAIM))
-                    exit_code = await supervisor.run(options.duration_s)
+                    closing.exit = exit_code = await supervisor.run(options.duration_s)
+        except asyncio.CancelledError:  # a signal before the first tick
+            exit_code = errors.Exit.INTERRUPTED if closing.exit is None else exit_code
+            raise
         except LinkError as error:
             supervisor.tell(run_events.Link(str(error), up=False))
             raise errors.DeviceError(str(error)) from None
@@ -300,7 +311,6 @@ async def _run(
             await bench.close()
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
             supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
-    return exit_code
 
 
 def _tell_all(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
@@ -369,41 +379,3 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
             loop.remove_signal_handler(number)
         for number, handler in before.items():
             signal.signal(number, handler)  # asyncio leaves the default: an end without clean-up
-
-
-def report(run_dir: Path, as_json: bool) -> None:
-    """Print the run's result and folder."""
-    summary_path = run_dir / "summary.json"
-    if as_json:
-        print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
-        return
-    if not run_dir.exists():
-        print(f"{run_dir}: removed or moved during the run; no data left", file=sys.stderr)
-        return
-    if summary_path.exists():
-        summary = json.loads(summary_path.read_text(encoding="utf-8"))
-        for line in _headline(summary):
-            print(line, file=sys.stderr)
-        anew_s = summary["recorder"].get("folder_anew_s")
-        if anew_s is not None:
-            print(f"the run folder was removed or moved; the new one starts at {anew_s:.1f} s", file=sys.stderr)
-    else:
-        print("summary.json is missing; the recorded data are readable", file=sys.stderr)
-    print(f"run folder: {run_dir}", file=sys.stderr)
-    if any(run_dir.glob("*.rrd")):
-        newest = run_dir.parent == Path(RecordingConfig().logs_dir)  # where `review` looks for `last`
-        print(f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}", file=sys.stderr)
-
-
-def _headline(summary: dict[str, object]) -> Iterator[str]:
-    labels: dict[str, tuple[str, Callable[[float], str]]] = {
-        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} um"),
-        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} um"),
-        "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
-        "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
-        "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),
-    }
-    for key, (label, show) in labels.items():
-        value = summary.get(key)
-        if isinstance(value, (int, float)) and math.isfinite(value):
-            yield f"{label + ':':34}{show(value)}"

@@ -136,11 +136,15 @@ class VirtualRun:
         """Record an event, now."""
         self._supervisor.tell(event)
 
+    @property
+    def exit(self) -> errors.Exit:
+        """The exit code; `INTERRUPTED` while the run has not ended."""
+        return errors.Exit.INTERRUPTED if self.finished is None else self.finished
+
     def end(self) -> None:
         """Record the end of the run."""
         supervisor = self._supervisor
-        exit_ = errors.Exit.INTERRUPTED if self.finished is None else self.finished
-        self.tell(run_events.Ended(exit_.name.lower(), int(exit_), supervisor.ticks, supervisor.missed_ticks))
+        self.tell(run_events.Ended(self.exit.name.lower(), int(self.exit), supervisor.ticks, supervisor.missed_ticks))
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._shape is None or self.now_s < self._shape_due_s:

@@ -4,21 +4,20 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rerun.chunk import RrdReader
 
 from membrane_ctrl.model import errors, files, plain_json, telemetry
 from membrane_ctrl.model.arrays import IntArray
-from membrane_ctrl.recorder import housekeeping, sink
+from membrane_ctrl.recorder import housekeeping
 from membrane_ctrl.run_files import column_reader, inputs_file, run, run_folder, streams, tables
 from membrane_ctrl.run_files.rrd_reader import REPAIRED
-from membrane_ctrl.run_files.segments import panics_are_faults, require_bounded
+from membrane_ctrl.run_files.segment_process import is_whole, read_parts
+from membrane_ctrl.run_files.segments import require_bounded
 from membrane_ctrl.run_files.summary import Summary
 
 # Rerun segments back to telemetry rows, for repairs and for replays that differ.
@@ -35,18 +34,11 @@ def read_rows(path: Path) -> telemetry.Rows:
     """
     where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
     found: dict[str, tuple[list[IntArray], list[telemetry.Rows]]] = {path: ([], []) for path in where}
-    require_bounded(path)
-    with warnings.catch_warnings(), panics_are_faults():
-        warnings.simplefilter("ignore")  # a segment without its footer is what this is for
-        for chunk in RrdReader(path).stream():
-            if chunk.entity_path not in where:
-                continue
-            batch = chunk.to_record_batch()
-            if _SCALARS in batch.schema.names and sink.RUN_TIME in batch.schema.names:
-                times, values = found[chunk.entity_path]
-                times.append(np.asarray(batch.column(sink.RUN_TIME).cast("int64")))
-                flat = np.asarray(batch.column(_SCALARS).flatten())
-                values.append(flat.reshape(-1, len(where[chunk.entity_path])))
+    for part in read_parts(path, set(where)):
+        if part.component == _SCALARS and part.values.shape[1] == len(where[part.entity]):
+            times, values = found[part.entity]
+            times.append(part.times_ns)
+            values.append(part.values)
     every = [times for times, _ in found.values() if times]
     if not every:
         return np.empty((0, len(telemetry.FIELDS)))
@@ -139,7 +131,7 @@ def _repair_segment(path: Path, in_place: bool) -> FileFinding:
         require_bounded(path)
     except OSError as error:
         return FileFinding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
-    if sink.is_whole(path):
+    if is_whole(path):
         return FileFinding(path.name, "whole", "")
     with files.scratch_folder(path.parent, ".repair-") as folder:
         part = folder / path.name
@@ -151,7 +143,7 @@ def _repair_segment(path: Path, in_place: bool) -> FileFinding:
             timeout=_SEGMENT_TIMEOUT_S,
             check=False,
         )
-        if not part.exists() or not sink.is_whole(part):
+        if not part.exists() or not is_whole(part):
             why = done.stderr.decode(errors="replace").strip().splitlines()
             return FileFinding(
                 path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})"

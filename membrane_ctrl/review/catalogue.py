@@ -15,6 +15,7 @@ import numpy as np
 from membrane_ctrl.model import errors, events, files, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.clock import parse_duration_s
+from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 from membrane_ctrl.run_files import column_reader, disk_budget, run_folder, tables
 from membrane_ctrl.run_files.run import Run, origin_of
 
@@ -48,6 +49,7 @@ class RunEntry:
     moving_s: float = math.nan
     pump_scale: float = math.nan  # flow against its configured curve as last learned, and one standard error
     pump_sigma: float = math.nan
+    ended_in: str = ""  # name of the fault in which the run ended, or is; empty without one
 
     @property
     def name(self) -> str:
@@ -129,6 +131,7 @@ def entry(folder: Path) -> RunEntry:
         **{name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")},
         pump_scale=math.nan if pump is None else _number(pump.scale),
         pump_sigma=math.nan if pump is None else _number(pump.sigma),
+        ended_in=_fault_of_end(log, summary.get("exit")),
     )
 
 
@@ -189,6 +192,15 @@ def as_dict(run: RunEntry) -> dict[str, Any]:
     """An entry as plain data."""
     texts = {"folder": str(run.folder), "started_utc": run.started_utc.isoformat()}
     return {"name": run.name} | asdict(run) | texts
+
+
+def _fault_of_end(log: Sequence[run_folder.LoggedEvent], exit_: object) -> str:
+    """Name of the fault in which a run ended, or is; empty without one."""
+    standing: events.Fault | None = None
+    for each in log:
+        standing = standing_fault_after(standing, each.event)
+    fault = fault_of_end(standing, exit_ if isinstance(exit_, str) else None)
+    return "" if fault is None else fault.name
 
 
 def _recorded_s(folder: Path) -> float:

@@ -41,6 +41,7 @@ def refuse_originals(folder: Path) -> None:
 FORMATS = ("parquet", "csv", "hdf5")
 SHAPES = "shapes"
 EVENTS = "events"
+_CHECK_S = 60.0  # for a search for damage in the Rerun segments
 _SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
@@ -207,6 +208,7 @@ def show_command(run: Path, json: bool) -> int:
     """Print one run: its line of the catalogue, its states and faults, its missing parts."""
     opened = open_run(catalogue.resolve(run))
     opened.look_through()
+    opened.check_segments(_CHECK_S)
     entry = catalogue.entry(opened.folder)
     if json:
         table = catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}
@@ -313,6 +315,7 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
             entry.configuration,
             f"{entry.size_mb:.1f}",
             one_line(entry.exit)
+            + (f" ({one_line(entry.ended_in)})" if entry.ended_in else "")
             + (f", {entry.marks} marked" if entry.marks else "")
             + (", kept" if entry.kept else ""),
         )

@@ -3,23 +3,21 @@
 Slow compared with the tables (a chunk per entity and second), but complete.
 """
 
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from membrane_ctrl.model.arrays import Column, IntArray
 from membrane_ctrl.run_files import column_reader, streams
-from membrane_ctrl.run_files.segments import FAULTS, ending, read_chunks, salvage
-
-if TYPE_CHECKING:
-    from rerun.chunk import Chunk
+from membrane_ctrl.run_files.segment_process import SegmentPart, read_parts, require_decodable
+from membrane_ctrl.run_files.segment_salvage import salvage
+from membrane_ctrl.run_files.segments import FAULTS, ending
 
 REPAIRED = "repaired"  # below the run: files repaired by `repair`
-_VALUES = ("Scalars:scalars", "Measurements:values")
+_CHECKED = "damaged"  # found by a check alone
 _VARIANCES = "Measurements:variances"
-_TIME = "run_time"
 
 
 def segments(folder: Path) -> list[Path]:
@@ -44,6 +42,8 @@ def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, 
     if "/tick/record" not in found:
         return {name: np.empty(0) for name in names}
     clock_ns = found["/tick/record"][0]
+    if not clock_ns.size:
+        return {name: np.empty(0) for name in names}
     columns: dict[str, Column] = {"mono_s": _seconds(clock_ns)}
     for entity, stream in wanted.items():
         times, values = found.get(entity, (clock_ns[:0], np.empty((0, len(stream.lines)))))
@@ -90,6 +90,28 @@ def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
     }
 
 
+def check_segments(folder: Path, limit_s: float, notes: list[str]) -> None:
+    """Decode the run's segments to find damage in them, for `limit_s` at most; notes what it finds.
+
+    A segment that is noted already is not read again.
+    """
+    until_s = time.monotonic() + limit_s
+    paths = [path for path in segments(folder) if not any(note.startswith(f"{path.name}:") for note in notes)]
+    for place, path in enumerate(paths):
+        if time.monotonic() > until_s:
+            notes.append(f"{path.name}: not checked for damage, as {len(paths) - place - 1} others, for lack of time")
+            return
+        try:
+            require_decodable(path)
+        except FAULTS as error:
+            column_reader.add_note(notes, f"{path.name}: {_CHECKED} ({_one_line(error)})")
+
+
+def _one_line(error: BaseException) -> str:
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0][:120]
+
+
 def _seconds(clock_ns: IntArray) -> Column:
     return np.asarray(clock_ns * 1e-9, dtype=np.float64)
 
@@ -97,12 +119,18 @@ def _seconds(clock_ns: IntArray) -> Column:
 def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tuple[IntArray, Column]]:
     """(times in ns, (n, m) values) of each scalar entity, sorted by time."""
     parts: dict[str, list[tuple[IntArray, Column]]] = {}
-    for entity, times, values in _chunks(path, entities, notes):
-        parts.setdefault(entity, []).append((times, values))
+    for part in _readable(path, entities, notes):
+        # variances are kept as those of another entity
+        entity = part.entity + (part.component if part.component == _VARIANCES else "")
+        parts.setdefault(entity, []).append((part.times_ns, part.values))
     joined = {}
-    for entity, chunks in parts.items():
-        times = np.concatenate([chunk[0] for chunk in chunks])
-        values = np.concatenate([chunk[1] for chunk in chunks])
+    for entity, found in parts.items():
+        width = _usual_width(found)
+        fitting = [part for part in found if part[1].shape[1] == width]
+        if len(fitting) < len(found):
+            column_reader.add_note(notes, f"{path.name}: rows with another number of values are left out")
+        times = np.concatenate([part[0] for part in fitting])
+        values = np.concatenate([part[1] for part in fitting])
         possible = column_reader.possible_times(_seconds(times))
         if not possible.all():
             column_reader.add_note(notes, f"{path.name}: rows with impossible times are left out")
@@ -112,46 +140,43 @@ def _scalars(path: Path, entities: set[str], notes: list[str]) -> dict[str, tupl
     return joined
 
 
-def _chunks(path: Path, entities: set[str], notes: list[str]) -> Iterator[tuple[str, IntArray, Column]]:
-    """Values of each entity, and its variances as those of another whose path ends in `_VARIANCES`."""
-    for chunk in _readable(path, entities, notes):
-        batch = chunk.to_record_batch()
-        there = [name for name in (*_VALUES, _VARIANCES) if name in batch.schema.names]
-        if _TIME not in batch.schema.names:
-            continue
-        for name in there:
-            values = batch.column(name).flatten().to_numpy(zero_copy_only=False).reshape(batch.num_rows, -1)
-            entity = chunk.entity_path + (name if name == _VARIANCES else "")
-            yield entity, batch.column(_TIME).cast("int64").to_numpy(), values
+def _usual_width(parts: list[tuple[IntArray, Column]]) -> int:
+    """Values in a row of an entity: those of most rows."""
+    rows: dict[int, int] = {}
+    for times, values in parts:
+        rows[values.shape[1]] = rows.get(values.shape[1], 0) + times.size
+    return max(rows, key=lambda width: rows[width])
 
 
-def _readable(path: Path, entities: set[str], notes: list[str]) -> list["Chunk"]:
+def _readable(path: Path, entities: set[str], notes: list[str]) -> list[SegmentPart]:
     whole = None
     try:
-        chunks = read_chunks(path, entities)
+        parts = read_parts(path, entities)
         closed, rest = ending(path)
         if closed:
-            return chunks
-        whole, why = (None, f"it ends {rest} bytes into a message") if rest else (chunks, "it has no end")
+            return parts
+        whole, why = (None, f"it ends {rest} bytes into a message") if rest else (parts, "it has no end")
     except FAULTS as error:
-        why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")[:120]
+        why = _one_line(error)
     try:
-        chunks = read_chunks(path.parent / REPAIRED / path.name, entities)
+        parts = read_parts(path.parent / REPAIRED / path.name, entities)
     except FAULTS:
         pass
     else:
         column_reader.add_note(notes, f"{path.name}: damaged or truncated, read from its copy in {REPAIRED}/ ({why})")
-        return chunks
+        return parts
     if whole is not None:
         column_reader.add_note(notes, f"{path.name}: has no end: still written, cut off, or its recorder killed")
         return whole
     try:
-        chunks, lost_bytes = salvage(path, entities)
+        parts, lost_bytes = salvage(path, entities)
     except OSError as error:
-        why, chunks, lost_bytes = error.strerror or str(error), [], 0
-    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if chunks else "all of it unreadable"
+        why, parts, lost_bytes = error.strerror or str(error), [], 0
+    readable = bool(parts) or 0 < lost_bytes < path.lstat().st_size
+    notes[:] = [note for note in notes if not note.startswith(f"{path.name}: {_CHECKED} (")]  # this says more
+    what = f"{lost_bytes / 1e3:.1f} kB of it are left out" if readable else "all of it unreadable"
     column_reader.add_note(notes, f"{path.name}: damaged or truncated, {what} ({why})")
-    return chunks
+    return parts
 
 
 # Reads a part of a run's telemetry, opening only the Rerun segments that may hold some of it.

@@ -185,10 +185,18 @@ class Run:
         files = column_reader.column_files(self.folder, tables.SHAPES)
         parts = (part for path in files for part in self._parts(path, files[-1], shapes.TABLE_COLUMNS))
         found = [shapes.from_table(table) for table in parts if table.num_rows]
-        if not found:
+        if not found and not self._measured_nothing():
             columns = [rrd_reader.read_shapes(path, self.notes) for path in rrd_reader.segments(self.folder)]
             found = [shapes.from_columns(part) for part in columns if part]
         return shapes.joined(found)
+
+    def _measured_nothing(self) -> bool:
+        """Whether there were no shape estimates: the segments need not be searched for them."""
+        return self.summary is not None and self.summary.get("cycles") == 0
+
+    def check_segments(self, limit_s: float) -> None:
+        """Decode the Rerun segments to find damage, for `limit_s` at most; `notes` names the damaged ones."""
+        rrd_reader.check_segments(self.folder, limit_s, self.notes)
 
     def look_through(self) -> None:
         """Check every table and segment, so that `notes` names all damage.

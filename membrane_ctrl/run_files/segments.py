@@ -8,17 +8,12 @@ import contextlib
 import errno
 import os
 import struct
-import tempfile
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from membrane_ctrl.model.files import open_plain
-
-if TYPE_CHECKING:  # listing runs need not load Rerun
-    from rerun.chunk import Chunk
 
 HEAD_BYTES = 12
 MAGIC = b"RRF2"
@@ -189,69 +184,5 @@ def ending(path: Path) -> tuple[bool, int]:
     return closed, 0 if closed else behind
 
 
-# Recovers the intact part of a Rerun segment that Rerun refuses: truncated, or damaged within.
-#
-# Rerun reads a file up to its first fault, and nothing of a truncated one. Here the complete messages are copied to a
-# temporary file and read from there; if one does not decode, bisection isolates it. The segment itself is never
-# changed.
-
-
 # Rerun's errors for unreadable data.
 FAULTS = (RuntimeError, ValueError, OSError)
-# A bad sector destroys a message or two; beyond this, give up on the rest of the file.
-_FAULTS_MAX = 50
-
-
-def read_chunks(path: Path, entities: set[str]) -> list["Chunk"]:
-    """Chunks of some entities. Raises one of `FAULTS` if Rerun refuses the file."""
-    from rerun.chunk import RrdReader
-
-    require_bounded(path)
-    with warnings.catch_warnings(), panics_are_faults():
-        warnings.simplefilter("ignore")  # the reader warns about a missing footer
-        return [chunk for chunk in RrdReader(path).stream() if chunk.entity_path in entities]
-
-
-def salvage(path: Path, entities: set[str]) -> tuple[list["Chunk"], int]:
-    """Chunks of some entities in a segment that Rerun refuses, and the number of bytes lost.
-
-    Raises OSError if the segment is unreadable, or there is no room for the copy.
-    """
-    found = whole_messages(path)
-    size = path.lstat().st_size
-    if not found:
-        return [], size
-    with tempfile.TemporaryDirectory(prefix="membrane-review-") as folder, open_plain(path) as source:
-        stores = [message for message in found if message.kind == STORE]
-        copy = _Copy(source, Path(folder) / "whole.rrd", stores, entities)
-        chunks = copy.chunks([message for message in found if message.kind not in {STORE, END}])
-    behind = 0 if found[-1].kind == END else size - found[-1].end
-    return chunks, behind + copy.lost_bytes
-
-
-@dataclass(slots=True)
-class _Copy:
-    source: BinaryIO
-    path: Path
-    stores: list[SegmentMessage]  # without them Rerun accepts no others
-    entities: set[str]
-    lost_bytes: int = 0
-    faults: int = 0
-
-    def chunks(self, part: list[SegmentMessage]) -> list["Chunk"]:
-        """Chunks of a part's decodable messages."""
-        self.source.seek(0)
-        with self.path.open("wb") as file:
-            file.write(self.source.read(HEAD_BYTES))
-            for message in (*self.stores, *part):
-                self.source.seek(message.start)
-                file.write(self.source.read(message.size))
-        try:
-            return read_chunks(self.path, self.entities)
-        except FAULTS:
-            if len(part) < 2 or self.faults >= _FAULTS_MAX:
-                self.faults += 1
-                self.lost_bytes += sum(message.size for message in part)
-                return []
-        half = len(part) // 2
-        return self.chunks(part[:half]) + self.chunks(part[half:])

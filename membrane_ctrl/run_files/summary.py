@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 
 # Statistics of a run of any length in constant memory.
 
@@ -172,6 +173,7 @@ class Summary:
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
         self._faults: list[EventLine] = []
+        self._standing: list[EventLine] = []  # the fault that stands, if one does; plain data, for the state file
         self._fault_count = 0
         self._geometry: EventLine = {}
         self._end: EventLine = {}
@@ -205,7 +207,10 @@ class Summary:
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
 
     def add_event(self, event: EventLine) -> None:
-        """Add one event; only "fault", "geometry" and "end" matter."""
+        """Add one event; only those of faults and states, "geometry" and "end" matter."""
+        if event.get("kind") in ("fault", "cleared", "state"):
+            standing = standing_fault_after(self._standing_fault(), run_events.from_dict(event))
+            self._standing = [] if standing is None else [standing.to_dict()]
         if event.get("kind") == "fault":
             self._fault_count += 1
             if len(self._faults) < _LISTED_MAX:
@@ -214,6 +219,13 @@ class Summary:
             self._geometry = {key: event.get(key) for key in ("hash", "file", "calibrated_utc")}
         elif event.get("kind") == "end":
             self._end = event
+
+    def _standing_fault(self) -> events.Fault | None:
+        for line in self._standing:
+            event = run_events.from_dict(line)
+            if isinstance(event, events.Fault):
+                return event
+        return None
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle."""
@@ -233,6 +245,7 @@ class Summary:
         """
         true, means = self._true_um, self._true_1s_um.result()
         held = means if means["seconds"] else self._reading_1s_um.result()
+        fault = fault_of_end(self._standing_fault(), self._end.get("exit"))
         return {
             "schema": SCHEMA,
             "exit": self._end.get("exit"),
@@ -259,6 +272,7 @@ class Summary:
             "transitions": self._transitions,
             "faults": self._faults,
             "fault_count": self._fault_count,
+            "ended_in": None if fault is None else fault.to_dict(),
             "dropped": dropped,
             "recorder": recorder,
             "end": self._end,

@@ -11,9 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.control_port.answers import Message
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, lock_lines, socket_path
 from membrane_ctrl.controller.commands import Command
@@ -21,6 +24,8 @@ from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, t
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.ring import attach
 from membrane_ctrl.sessions.live_log import LiveLog
+
+_S = TypeVar("_S", bound=BaseModel)
 
 
 class HoldError(Exception):
@@ -69,24 +74,36 @@ _SILENT_S = 5.0  # after this long without a tick, the run has ended or hangs
 
 
 class LiveHold:
-    """A `HoldLink` to a run on this machine; with `take_over` its first command takes over from another commander.
+    """A `HoldLink` to a run on this machine.
 
-    Raises InputError if `run_dir` is not the folder of the client's run, or has no rings.
+    Parameters
+    ----------
+    client : PortClient
+        Connected to the run.
+    run_dir : path
+        The run's folder.
+    take_over : bool
+        Take command from whoever has it: at once with a `session`, else with the first command.
+    session : str
+        Claim command for a session of this name, until `close`; empty: only watch, or command like any client.
+
+    Raises InputError if `run_dir` is not the folder of the client's run or has no rings, or if another session or
+    client has command; DeviceError if the peer is not a hold.
     """
 
-    def __init__(self, client: PortClient, run_dir: str | Path, take_over: bool = False) -> None:
+    def __init__(self, client: PortClient, run_dir: str | Path, take_over: bool = False, session: str = "") -> None:
         run_dir = Path(run_dir)
         self._client, self._take_over = client, take_over
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
-        status = client.ask(do="status")
-        loop, pump = (
-            kind.model_validate(status[name])
-            for name, kind in (("loop", schema.LoopConfig), ("pump", schema.PumpConfig))
-        )
+        answer = client.status()
+        loop = _settings(schema.LoopConfig, answer, "loop")
+        pump = _settings(schema.PumpConfig, answer, "pump")
         config = toml_file.load(run_dir / "config.toml", schema.Config)
         self.config = config.model_copy(update={"loop": loop, "pump": pump})
         self.name, self.run_dir = run_dir.name, run_dir
+        if session:
+            self._claim(session)
         try:
             self._readers = attach(run_dir)
         except (OSError, ValueError) as error:
@@ -94,6 +111,12 @@ class LiveHold:
                 f"{run_dir}: its rings cannot be read ({error}); is it on this machine?"
             ) from None
         self._heard_s = time.monotonic()
+
+    def _claim(self, session: str) -> None:
+        answer = self._client.ask(do="claim", text=session, why="session", take_over=self._take_over)
+        self._take_over = False
+        if not answer["ok"]:
+            raise errors.InputError(f"{session}: refused: {answer['refused']}")
 
     def ask(self, command: Command) -> None:
         """Send a command through the port, which determines our name."""
@@ -114,12 +137,13 @@ class LiveHold:
         except errors.DeviceError as error:
             raise HoldError(str(error)) from None
         self._take_over = False
-        if not answer.get("ok"):
-            raise HoldError(f"refused: {answer.get('refused')}")
+        if not answer["ok"]:
+            raise HoldError(f"refused: {answer['refused']}")
 
     def news(self) -> News:
         """The news of a fifth of a second."""
         time.sleep(_NEWS_S)
+        self._require_command()
         try:
             found = self._read_rings()
         except (struct.error, ValueError) as error:
@@ -130,6 +154,15 @@ class LiveHold:
         elif now_s - self._heard_s > _SILENT_S:
             raise HoldError(f"no tick for {_SILENT_S:g} s: has the hold {self.name} ended?")
         return found
+
+    def _require_command(self) -> None:
+        """Raises HoldError if another client has taken over command, or the hold has hung up."""
+        try:
+            self._client.poll()
+        except errors.DeviceError as error:
+            raise HoldError(str(error)) from None
+        if self._client.command_taken:
+            raise HoldError(self._client.command_taken)
 
     def _read_rings(self) -> News:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
@@ -148,11 +181,23 @@ class LiveHold:
             reader.close()
 
 
+def _settings(kind: type[_S], answer: Message, key: str) -> _S:
+    """Settings in an answer. Raises DeviceError if they are not there, or not settings."""
+    try:
+        return kind.model_validate(answer.get(key))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise errors.DeviceError(f"not an answer of a hold ({key}: {first['msg']})") from None
+
+
 @contextlib.contextmanager
-def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool = False) -> Iterator[LiveHold]:
+def live_hold(
+    where: Where, take_over: bool, needs_operate: str = "", wait: bool = False, session: str = ""
+) -> Iterator[LiveHold]:
     """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role is read.
 
-    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before.
+    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before. With `session`, command is
+    claimed under this name.
     """
     socket = socket_path(where)
     until_s = time.monotonic() + (_STARTS_S if wait else 0.0)
@@ -160,13 +205,13 @@ def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool
         time.sleep(_POLL_S)
     client = PortClient.unix(socket, lambda text: print(f"notice: {text}", file=sys.stderr))
     try:
-        while wait and client.ask(do="status")["status"].get("state") != "hold":
+        while wait and client.status()["status"]["state"] != "hold":
             _require_unlocked(client)
             time.sleep(_POLL_S)
         _require_unlocked(client)
         if needs_operate and client.greeting["role"] == "read":
             raise errors.InputError(f"{needs_operate} needs the role operate; {client.greeting['you']} has read")
-        link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over)
+        link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over, session)
     except BaseException:
         client.close()
         raise
@@ -176,7 +221,7 @@ def live_hold(where: Where, take_over: bool, needs_operate: str = "", wait: bool
 
 def _require_unlocked(client: PortClient) -> None:
     """Raise DeviceError if the mirror is locked: the hold would refuse every experiment."""
-    lines = lock_lines(client.ask(do="status").get("status") or {})
+    lines = lock_lines(client.status()["status"])
     if lines:
         raise errors.DeviceError(f"locked: {'; '.join(lines)}; ask its author, then `membrane-ctrl ctl unlock WORD`")
 

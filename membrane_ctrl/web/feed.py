@@ -5,7 +5,6 @@ client that does not read, and a ring overwrites what nobody has taken.
 """
 
 import math
-import struct
 import threading
 import time
 from collections import deque
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.console.model import event_words
-from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.ctl import Where, connected
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
@@ -131,8 +130,8 @@ class HoldFeed:
     def close(self) -> None:
         """Stop following; returns once the thread has ended, or after a few seconds."""
         self._ending.set()
-        with suppress(AttributeError, OSError):
-            self._client.close()  # type: ignore[union-attr]
+        if self._client is not None:
+            self._client.close()
         self._thread.join(5.0)
 
     def ask(self, request: Message) -> str:
@@ -140,7 +139,7 @@ class HoldFeed:
         what = str(request["do"]).replace("_", " ")
         try:
             with connected(self._where, notice=lambda _: None) as client:
-                if client.greeting.get("run") != self.seen.name:
+                if client.greeting["run"] != self.seen.name:
                     return f"{what}: not sent: another run is listening now; look again"
                 answer = client.ask(**request)
         except errors.CommandError as error:
@@ -154,12 +153,14 @@ class HoldFeed:
     def _follow(self) -> None:
         while not self._ending.is_set():
             try:
-                with connected(self._where, notice=self._events.append) as client:
+                with connected(self._where, self._events.append, ANSWER_S) as client:
                     self._client = client
                     self._watch(client)
                     problem = "the run has ended" if self.seen.status else "the connection was closed"
-            except (errors.CommandError, OSError, ValueError, struct.error) as error:
-                problem = str(error)
+            except errors.CommandError as error:
+                problem = "; ".join(error.lines)
+            except Exception as error:  # whatever this hold causes, its feed tries again and the others continue
+                problem = f"{type(error).__name__}: {error}"
             self.seen = replace(self.seen, problem=problem, role="read")
             self._ending.wait(_AGAIN_S)
 

@@ -33,9 +33,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     return requests
 
 
-def test_there_is_an_action_for_every_command_but_tune() -> None:
+def test_there_is_an_action_for_every_command_but_those_of_sessions() -> None:
     shape = {"shape_on", "shape_off"}
-    assert {*ACTIONS, *shape} == {*TABLE, *SAME_AS, *get_args(protocol.Errand), "shape"} - {"tune"}
+    assert {*ACTIONS, *shape} == {*TABLE, *SAME_AS, *get_args(protocol.Errand), "shape"} - {"tune", "claim"}
 
 
 @pytest.mark.parametrize("action", ACTIONS)

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
+from membrane_ctrl.control_port.commander import Commander
 from membrane_ctrl.control_port.endpoint import Refusals
-from membrane_ctrl.control_port.protocol import Commander, Peer, may_not
+from membrane_ctrl.control_port.protocol import Peer, may_not
 from membrane_ctrl.model.events import Event
 
 

@@ -90,7 +90,7 @@ async def test_one_commander_at_a_time(tmp_path: Path) -> None:
         assert (await bob.ask(do="mark", text="bob was here"))["ok"], "a mark moves nothing"
         assert (await bob.ask(do="setpoint", value=2.0, take_over=True, why="shift"))["ok"]
         notice = await ann.get()
-        assert notice == {"notice": "unix:bob has taken over command: shift"}
+        assert notice == {"notice": "unix:bob has taken over command: shift", "code": "command_taken"}
         assert "unix:bob has command" in (await ann.ask(do="setpoint", value=1.0))["refused"]
         assert [(e["who"], e["former"]) for e in run.of_kind("commander")] == [
             ("unix:ann", None),
@@ -328,13 +328,13 @@ def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
         with ThreadPoolExecutor(1) as elsewhere:
             second = elsewhere.submit(PortClient.unix, path, print)
             with endpoint.accept()[0], endpoint.accept()[0] as accepted:
-                accepted.sendall(b'{"membrane_ctrl": 1}\n')
+                accepted.sendall(b'{"membrane_ctrl": 1, "run": "r", "you": "unix:ann", "role": "tune"}\n')
                 with second.result() as client:
-                    assert client.greeting == {"membrane_ctrl": 1}
+                    assert client.greeting["run"] == "r"
 
 
 def test_an_endpoint_that_is_flooded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.client._TURN", struct.pack("ll", 0, 50_000))
+    monkeypatch.setattr("membrane_ctrl.control_port.client._kernel_time", lambda _: struct.pack("ll", 0, 50_000))
     with socket.socket(socket.AF_UNIX) as endpoint, socket.socket(socket.AF_UNIX) as first:
         endpoint.bind(str(tmp_path / "control.sock"))
         endpoint.listen(0)

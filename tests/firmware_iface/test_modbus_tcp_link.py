@@ -338,3 +338,17 @@ async def test_the_servers_wrong_transaction_ids_time_out(setup: Setup) -> None:
         await link.read_holding(0, 1)
     await link.close()
     await server.stop()
+
+
+@pytest.mark.parametrize("data", [b"x" * 65536, b"\0" * 65536, b"\0\1\0\0\xff\xff" + b"\1" * 65530])
+async def test_a_peer_that_sends_without_end_is_given_up_before_it_delays_the_process(
+    setup: Setup, data: bytes
+) -> None:
+    setup.server.reply = lambda transaction, unit, pdu: [data] * 20
+    link = await setup.connected(timeout_s=5.0)
+    loop = asyncio.get_running_loop()
+    began_s = loop.time()
+    with pytest.raises(LinkDownError, match="sends more than an answer"):
+        await link.read_holding(0, 2)
+    assert loop.time() - began_s < 1.0
+    assert not link.connected

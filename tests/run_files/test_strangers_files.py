@@ -164,7 +164,7 @@ _OWN = {
     # the machine's own folder of locks, whose owner and mode are checked
     "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named
-    "sim/optics/simulate.py", "replay/command.py", "run_files/segments.py", "review/viewer/command.py",
+    "sim/optics/simulate.py", "replay/command.py", "run_files/segment_salvage.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "calibration/report.py", "geometry/spread_file.py", "commissioning/devices.py",
     # the project's own pages

@@ -11,7 +11,10 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
+from membrane_ctrl.model.events import Fault
+from membrane_ctrl.model.object_codec import Decoder, encode
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
+from membrane_ctrl.recorder.recorder import _SPECIALS
 from membrane_ctrl.run_files.summary import SCHEMA, Summary, held_at
 from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
 
@@ -134,6 +137,21 @@ def test_events_and_cycles() -> None:
     assert found["duration_s"] == 9.5
     assert (found["cycles"], found["cycles_rejected"]) == (40, 3)
     assert found["cycle_latency_ms"]["p50"] == pytest.approx(np.quantile(latencies_s, 0.5) * 1e3, rel=0.05)
+
+
+def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_recorder() -> None:
+    summary = Summary(Config())
+    fault = Fault(
+        14, "laser_implausible", "the laser is wrong", "laser +9 um", "limits.x", "hold_flow", False, "look"
+    )
+    summary.add_event({"mono_s": 1.0, **fault.to_dict()})
+    state = json.loads(json.dumps(encode(summary, _SPECIALS)))
+    restored = Decoder((Summary(Config()),), _SPECIALS).decode(state, Summary)
+    for each in (summary, restored):
+        each.add_event({"kind": "end", "mono_s": 2.0, "exit": "safety_trip"})
+        assert each.as_dict({}, {})["ended_in"] == fault.to_dict()
+    summary.add_event({"kind": "state", "state": "standby", "from": "fault", "why": "acknowledged"})
+    assert summary.as_dict({}, {})["ended_in"] is None
 
 
 def test_lists_do_not_grow_with_a_flickering_state() -> None:

@@ -1,0 +1,81 @@
+"""Sends a notice through several services at once, in bounded time and memory.
+
+A mail or web server may answer without end, or a byte a minute; the libraries behind Apprise read all of it. So each
+service has a thread of its own, which is left behind after `SERVICE_S`, and the process has a limit of memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import resource
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+SERVICE_S = 60.0  # for one notice; a mail server may take most of it
+_MEMORY_BYTES = 400_000_000  # beyond what the process has; an honest answer has some kilobytes
+
+
+class Service:
+    """One service: an Apprise plug-in that is called in a thread."""
+
+    def __init__(self, plugin: Any) -> None:
+        self._plugin = plugin
+        self._thread: threading.Thread | None = None
+        self._begun = False
+        self._accepted = False
+
+    def begin(self, title: str, body: str, kind: str) -> None:
+        """Begin to send, unless the last attempt still hangs."""
+        self._begun = self._thread is None or not self._thread.is_alive()
+        if not self._begun:
+            return
+        self._accepted = False
+        self._thread = threading.Thread(target=self._send, args=(title, body, kind), daemon=True)
+        self._thread.start()
+
+    def accepted(self, until_s: float) -> bool:
+        """Whether the service has accepted the notice of the last `begin`, by a time of the monotonic clock."""
+        if self._thread is None or not self._begun:  # what still hangs is an earlier notice
+            return False
+        self._thread.join(max(0.0, until_s - time.monotonic()))
+        return not self._thread.is_alive() and self._accepted
+
+    def _send(self, title: str, body: str, kind: str) -> None:
+        try:
+            self._accepted = bool(self._plugin.notify(title=title, body=body, notify_type=kind))
+        except Exception as error:  # plug-ins raise anything, and MemoryError at the limit
+            logging.getLogger(__name__).warning("%s: %s", type(self._plugin).__name__, type(error).__name__)
+
+
+def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -> bool:
+    """Send a notice to every service; one success suffices: a dead chat server must not repeat the mail forever."""
+    until_s = time.monotonic() + SERVICE_S
+    for service in services:
+        service.begin(title, body, kind)
+    accepted = [service.accepted(until_s) for service in services]  # wait for all: each gets every notice
+    return any(accepted)
+
+
+@contextlib.contextmanager
+def limited_memory() -> Iterator[None]:
+    """Within this context, the process may take `_MEMORY_BYTES` more than it has."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    most_bytes = _data_bytes() + _MEMORY_BYTES
+    if before[0] != resource.RLIM_INFINITY:
+        most_bytes = min(most_bytes, before[0])
+    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def _data_bytes() -> int:
+    """Memory of the process that counts against the limit."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    kilobytes = next(line.split()[1] for line in lines if line.startswith("VmData:"))
+    return 1024 * int(kilobytes)

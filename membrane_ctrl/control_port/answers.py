@@ -1,0 +1,261 @@
+"""What a hold may send to its clients, as schemas: greeting, answers, notices, status and events.
+
+A client talks to whatever listens at an address, which may be another program, a damaged hold or a hostile one. So
+every message is checked before any part of it is used: the syntax (`decode`), sizes, numbers and texts whatever their
+meaning (`_clean`), then the fields that clients read (the models). A hold of a later version may send further fields;
+they pass if they are plain.
+
+Messages stay dictionaries with the keys that were sent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.model import plain_json, terminal
+
+Message = dict[str, Any]
+
+# A status has some 150 values, four levels deep, and its texts are sentences.
+_VALUES_MAX = 2000
+_DEPTH_MAX = 8
+_TEXT_MAX = 2000
+_KEY_MAX = 64
+_NUMBER_MAX = 1e16  # beyond any quantity, counter or time of a hold, and short enough to print
+_QUOTED_MAX = 120
+
+
+class AnswerError(ValueError):
+    """A message that no hold sends; the text names the field and the problem."""
+
+
+def decode(line: bytes) -> Message:
+    """Decode a message. Raises AnswerError unless it is a bounded, plain JSON object."""
+    try:
+        message = plain_json.loads(line.decode("utf-8"))
+    except (ValueError, OverflowError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise AnswerError("not JSON") from None
+    if not isinstance(message, dict):
+        raise AnswerError("not a JSON object")
+    budget = [_VALUES_MAX]
+    cleaned = _clean(message, "", 0, budget)
+    assert isinstance(cleaned, dict)
+    return cleaned
+
+
+def _clean(value: object, field: str, depth: int, budget: list[int]) -> object:
+    """Check a value of any meaning; texts lose what a terminal would execute."""
+    budget[0] -= 1
+    if budget[0] < 0:
+        raise AnswerError(f"more than {_VALUES_MAX} values")
+    if depth > _DEPTH_MAX:
+        raise AnswerError(f"{field}: nested too deep")
+    if isinstance(value, dict):
+        return {
+            _clean_key(key, field): _clean(item, _joined(field, key), depth + 1, budget)
+            for key, item in value.items()
+        }
+    if isinstance(value, list):
+        return [_clean(item, _joined(field, str(place)), depth + 1, budget) for place, item in enumerate(value)]
+    if isinstance(value, str):
+        return _clean_text(value, field)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return _checked_number(value, field)
+    return value
+
+
+def _clean_key(key: str, field: str) -> str:
+    if len(key) > _KEY_MAX or not key.isprintable():
+        raise AnswerError(f"{field or 'message'}: a key that is not a name")
+    return key
+
+
+def _clean_text(text: str, field: str) -> str:
+    if len(text) > _TEXT_MAX:
+        raise AnswerError(f"{field}: a text of more than {_TEXT_MAX} characters")
+    return terminal.one_line(text)
+
+
+def _checked_number(value: int | float, field: str) -> int | float:
+    if not math.isfinite(value):
+        raise AnswerError(f"{field}: not a finite number")
+    if abs(value) > _NUMBER_MAX:
+        raise AnswerError(f"{field}: too large a number")
+    return value
+
+
+def _joined(field: str, key: str) -> str:
+    """The name of an inner field; a peer's own keys may appear in it, so it is kept short and plain."""
+    name = f"{field}.{key}" if field else key
+    return terminal.one_line(name[:_QUOTED_MAX])
+
+
+# The fields that clients read. Anything else is allowed, as long as it is plain.
+
+_Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,39}$")]
+_Number = Annotated[float, Field(strict=True)]
+_Count = Annotated[int, Field(strict=True, ge=0)]
+_Text = Annotated[str, Field(strict=True)]
+# The name of a folder: clients look for the run's files under it.
+RunName = Annotated[str, StringConstraints(strict=True, pattern=r"^[^/.\x00][^/\x00]{0,199}$")]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class FaultPart(_Part):
+    """A fault in a status."""
+
+    code: _Count
+    name: _Text
+    cause: _Text
+    remedy: _Text
+
+
+class GeometryPart(_Part):
+    """The geometry in use."""
+
+    file: _Text | None = None
+    calibrated_utc: _Text | None = None
+    hash: _Text = ""
+    message: _Text = ""
+
+
+class GainsPart(_Part):
+    """The gains in use."""
+
+    kp_per_s: _Number
+    ti_s: _Number
+    td_s: _Number
+
+
+class SessionPart(_Part):
+    """The session that has command of the hold."""
+
+    id: _Text
+    what: _Text
+    who: _Text
+    pid: _Count | None = None
+    since_utc: _Text
+
+
+class StatusPart(_Part):
+    """A hold's status (`server.status_table` and `Port.status`)."""
+
+    state: _Name
+    why: _Text
+    run: RunName | None = None
+    fault: FaultPart | None = None
+    row: dict[_Name, _Number | None] | None = None
+    maintenance: dict[str, _Text] = {}
+    recording: dict[str, _Text] = {}
+    gains: GainsPart | None = None
+    geometry: GeometryPart | None = None
+    safe_level: _Name | None = None
+    shape: _Name | None = None
+    shape_reason: _Text = ""
+    state_age_s: _Number | None = None
+    trial_left_s: _Number | None = None
+    commander: _Text | None = None
+    command_session: SessionPart | None = None
+    clients: _Count = 0
+
+
+class EventPart(_Part):
+    """An event; its other keys depend on its kind (`run_events.from_dict` checks them)."""
+
+    kind: _Name
+    mono_s: _Number | None = None
+
+
+class GreetingPart(_Part):
+    """The first message of a hold."""
+
+    membrane_ctrl: Annotated[int, Field(strict=True, ge=1)]
+    run: RunName
+    you: _Text
+    role: Role
+    commander: _Text | None = None
+
+
+class AnswerPart(_Part):
+    """The answer to a request."""
+
+    number: _Count
+    ok: Annotated[bool, Field(strict=True)]
+    refused: _Text | None = None
+    state: _Name | None = None
+    status: StatusPart | None = None
+    loop: dict[str, Any] | None = None
+    pump: dict[str, Any] | None = None
+
+
+class StreamedPart(_Part):
+    """A message of `watch`."""
+
+    status: StatusPart | None = None
+    event: EventPart | None = None
+
+
+class NoticePart(_Part):
+    """A message for the person at the client; a `code` makes it one for the program as well."""
+
+    notice: _Text
+    code: _Name | None = None
+
+
+COMMAND_TAKEN = "command_taken"  # the code of a notice: another client has command now
+
+Kind = Literal["answer", "notice", "streamed", "unknown"]
+
+
+def kind_of(message: Message) -> Kind:
+    """What a message is, by its keys."""
+    if "number" in message:
+        return "answer"
+    if "notice" in message:
+        return "notice"
+    if "status" in message or "event" in message:
+        return "streamed"
+    return "unknown"
+
+
+_MODELS: dict[Kind, type[_Part]] = {
+    "answer": AnswerPart,
+    "notice": NoticePart,
+    "streamed": StreamedPart,
+    "unknown": _Part,
+}
+
+
+def check_message(message: Message) -> Message:
+    """Return a message as it was sent, checked. Raises AnswerError."""
+    return check(message, _MODELS[kind_of(message)])
+
+
+def check_greeting(message: Message) -> Message:
+    """Return a greeting, checked. Raises AnswerError."""
+    if "membrane_ctrl" not in message:
+        raise AnswerError("not a control port of membrane-ctrl")
+    return check(message, GreetingPart)
+
+
+def check(message: Message, model: type[BaseModel]) -> Message:
+    """Return a decoded message if it fits a model. Raises AnswerError naming the first field that does not."""
+    try:
+        model.model_validate(message)
+    except ValidationError as error:
+        raise AnswerError(_described(error)) from None
+    return message
+
+
+def _described(error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+    field = ".".join(str(part) for part in first["loc"])
+    problem = "missing" if first["type"] == "missing" else first["msg"][:1].lower() + first["msg"][1:]
+    return terminal.one_line(f"{field[:_QUOTED_MAX]}: {problem}"[: 2 * _QUOTED_MAX])

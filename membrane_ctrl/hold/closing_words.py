@@ -1,0 +1,107 @@
+"""What a run prints at its end: the fault in which it ends, then its figures and its folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.config.schema import RecordingConfig
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.model import errors, events
+from membrane_ctrl.model.standing_fault import standing_fault_after
+
+_UNKNOWN_PUMP = (
+    "DEVICE FAILED: the board did not answer while the run stopped, so that the state of the pump is unknown",
+    "  to do:    look whether the pump runs, and switch off its supply; then find out why the link failed",
+)
+_NO_FAULT = (
+    "SAFETY TRIP: the control program failed in the fault state",
+    "  to do:    see the last lines of events.jsonl in the run folder, and report them",
+)
+
+
+@dataclass(slots=True)
+class Closing:
+    """How a run ends, as its own process knows it: no disk is needed.
+
+    Attributes
+    ----------
+    exit : Exit or None
+        The exit code; None until the run has ended.
+    fault : Fault or None
+        The fault that stands; None if there is none.
+    fault_s : float
+        When it tripped, on the run's clock.
+    """
+
+    exit: errors.Exit | None = None
+    fault: events.Fault | None = None
+    fault_s: float = math.nan
+
+    def heard(self, outputs: TickOutputs) -> None:
+        """Note a tick's events."""
+        for event in outputs.events:
+            if isinstance(event, events.Fault):
+                self.fault_s = outputs.row.mono_s
+            self.fault = standing_fault_after(self.fault, event)
+
+
+def closing_lines(closing: Closing) -> list[str]:
+    """The lines about a fault: code and name, what was seen, what to do; nothing for a run that ended well."""
+    if closing.exit not in (errors.Exit.SAFETY_TRIP, errors.Exit.DEVICE_FAILED):
+        return []
+    fault = closing.fault
+    if fault is None:
+        return list(_UNKNOWN_PUMP if closing.exit == errors.Exit.DEVICE_FAILED else _NO_FAULT)
+    limit = f" (limit: {fault.limit})" if fault.limit else ""
+    return [
+        f"FAULT {fault.code} {fault.name}: {fault.cause}",
+        f"  seen:     {fault.seen}{limit}, {closing.fault_s:.1f} s after the start",
+        f"  to do:    {fault.remedy}",
+    ]
+
+
+def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None:
+    """Print how the run ended, a fault first, then its result and folder."""
+    for line in closing_lines(closing) if closing is not None else ():
+        print(line, file=sys.stderr)
+    summary_path = run_dir / "summary.json"
+    if as_json:
+        print(summary_path.read_text(encoding="utf-8") if summary_path.exists() else "{}")
+        return
+    if not run_dir.exists():
+        print(f"{run_dir}: removed or moved during the run; no data left", file=sys.stderr)
+        return
+    if summary_path.exists():
+        summary = json.loads(summary_path.read_text(encoding="utf-8"))
+        for line in _headline(summary):
+            print(line, file=sys.stderr)
+        anew_s = summary["recorder"].get("folder_anew_s")
+        if anew_s is not None:
+            print(f"the run folder was removed or moved; the new one starts at {anew_s:.1f} s", file=sys.stderr)
+    else:
+        print("summary.json is missing; the recorded data are readable", file=sys.stderr)
+    print(f"run folder: {run_dir}", file=sys.stderr)
+    if any(run_dir.glob("*.rrd")):
+        newest = run_dir.parent == Path(RecordingConfig().logs_dir)  # where `review` looks for `last`
+        print(f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}", file=sys.stderr)
+
+
+def _headline(summary: dict[str, object]) -> Iterator[str]:
+    labels: dict[str, tuple[str, Callable[[float], str]]] = {
+        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} um"),
+        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} um"),
+        "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
+        "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
+        "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),
+        "fault_count": ("faults during the run", lambda v: f"{v:.0f}"),
+    }
+    for key, (label, show) in labels.items():
+        value = summary.get(key)
+        if isinstance(value, (int, float)) and math.isfinite(value):
+            yield f"{label + ':':34}{show(value)}"
