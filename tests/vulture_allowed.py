@@ -34,3 +34,5 @@ PageLoop  # named as text to uvicorn
 _.state, _.why, _.run, _.fault, _.row, _.maintenance, _.recording, _.gains, _.geometry, _.safe_level, _.shape
 _.shape_reason, _.state_age_s, _.trial_left_s, _.commander, _.command_session, _.clients, _.mono_s, _.refused
 _.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _.since_utc, _.kp_per_s, _.ti_s, _.td_s
+find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults.md, the safety case and the campaign
+_.sent  # of an event, written as a whole

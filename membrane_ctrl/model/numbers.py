@@ -11,7 +11,6 @@ import re
 
 TEXT_LENGTH_MAX = 64  # the longest exact double in plain notation with 17 digits needs fewer
 _PLAIN = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_PLAIN_WHOLE = re.compile(r"[+-]?[0-9]+")
 
 
 def parse_number(text: str) -> float:
@@ -33,7 +32,8 @@ def parse_number(text: str) -> float:
     ValueError
         With one line that names the text and the reason.
     """
-    _require_short(text)
+    if len(text) > TEXT_LENGTH_MAX:
+        raise ValueError(f"{text[:16]!r}... is not a number: {len(text)} characters, at most {TEXT_LENGTH_MAX}")
     if "," in text:
         raise ValueError(f"{text!r} has a comma; write a point before the decimals, and nothing between thousands")
     if _PLAIN.fullmatch(text) is None:
@@ -42,17 +42,3 @@ def parse_number(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text!r} is too large")
     return value
-
-
-def parse_whole_number(text: str) -> int:
-    """Parse a whole number: optional sign and ASCII digits. Raises ValueError as `parse_number`."""
-    _require_short(text)
-    if _PLAIN_WHOLE.fullmatch(text) is None:
-        raise ValueError(f"{text!r} is not a plain whole number such as 12")
-    return int(text)
-
-
-def _require_short(text: str) -> None:
-    """Raise ValueError for a text that no number needs; it is not quoted in full."""
-    if len(text) > TEXT_LENGTH_MAX:
-        raise ValueError(f"{text[:16]!r}... is not a number: {len(text)} characters, at most {TEXT_LENGTH_MAX}")
