@@ -334,7 +334,8 @@ async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
         assert await said_by(HOSTILE_OPCUA, ports) == {
             "nan": finite, "text": f"Setpoint: enter a number in um: 'abc' {NO_NUMBER}",
             "none": f"Setpoint: enter a number in um: '' {NO_NUMBER}",
-            **dict.fromkeys(("two", "array", "bytes"), "BadInvalidArgument"), "huge": "setpoint refused: longer than 500 bytes",
+            **dict.fromkeys(("two", "array", "bytes"), "BadInvalidArgument"),
+            "huge": "setpoint refused: longer than 500 bytes",
             **dict.fromkeys(("add", "delete", "shut", "unit"), "BadUserAccessDenied"),
         }  # fmt: skip
         fields = ("FLNK mir", "OUT mir", "SCAN [6]", "PROC [1]")
