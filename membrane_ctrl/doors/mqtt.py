@@ -33,6 +33,7 @@ from membrane_ctrl.doors.names import TABLE, Door, Published
 from membrane_ctrl.model import errors, files
 
 _LEAVES_S = 2.0
+_ANSWER_S = 5.0  # of the broker to each message
 _AGAIN_S = 1.0  # a returned broker has values within two seconds, however long it was away
 _STEADY_S = 10.0  # a connection that lasted so long worked: the next failure is a new one, and is printed
 _KEEPALIVE_S = 10  # the broker notices a cut line after one and a half of these
@@ -66,6 +67,10 @@ async def serve(config: MqttConfig, door: Door) -> None:
                 reason = "; ".join(dict.fromkeys(map(str, reasons)))
                 print(f"mqtt: {broker.where}: {reason}; trying again", file=sys.stderr, flush=True)
             printed = True
+        # An error of a connection that is being closed takes the place of the cancellation that closes it.
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            raise asyncio.CancelledError
         await asyncio.sleep(_AGAIN_S)
 
 
@@ -115,6 +120,7 @@ class Broker:
             will=will,
             tls_context=self._context,
             keepalive=_KEEPALIVE_S,
+            timeout=_ANSWER_S,
             queue_type=cast(type[Inbox], make_queue),
         )
 

@@ -9,6 +9,7 @@ import json
 import os
 import random
 import resource
+import signal
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -25,7 +26,7 @@ from membrane_ctrl.doors.names import Door
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.telemetry import State
 from tests.control_port.port_run import PortRun, port_run
-from tests.doors.test_door_clients import MOSQUITTO, broker
+from tests.doors.test_door_clients import MOSQUITTO, broker, program
 from tests.doors.test_doors import STRANGE_NUMBERS, door_with, seen_hold
 from tests.web.test_page import free_port
 
@@ -110,6 +111,7 @@ async def listening(port: int) -> AsyncIterator[Listener]:
 async def bridge(folder: Path) -> AsyncIterator[tuple[PortRun, Listener, int]]:
     """A run, a broker, a bridge between them, and a listener."""
     port = free_port()
+    asyncio.get_running_loop().set_debug(False)  # which makes each message several times as slow
     async with port_run(folder) as run, broker(port), listening(port) as listener, serving(port, door_to(folder)):
         await listener.until(lambda: "online" in listener.of("availability"))
         yield run, listener, port
@@ -405,6 +407,27 @@ async def test_younger_claims_do_not_disturb_an_owner(tmp_path: Path) -> None:
         own = [each for each in listener.of("owner") if '"elsewhere"' not in each]
         assert 1 <= len(own) <= 15, "a flood of claims is not answered by a flood"
         assert len(listener.of("values")) >= 1
+
+
+@pytest.mark.parametrize("trouble", [signal.SIGSTOP, signal.SIGKILL])
+async def test_a_bridge_ends_though_its_broker_hangs_or_dies_at_that_moment(
+    tmp_path: Path, trouble: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt, "_ANSWER_S", 1.0)
+    assert MOSQUITTO is not None
+    port = free_port()
+    async with program(MOSQUITTO, "-p", str(port)) as process:
+        door = door_to(tmp_path)
+        task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), door))
+        async with contextlib.AsyncExitStack() as stack:
+            await asyncio.sleep(1.0)
+            listener = await stack.enter_async_context(listening(port))
+            await listener.until(lambda: "online" in listener.of("availability"))
+        process.send_signal(trouble)
+        task.cancel()
+        done, _ = await asyncio.wait({task}, timeout=10.0)
+        assert done == {task}
+        assert task.cancelled()
 
 
 @pytest.mark.parametrize("behaviour", ["silent", "closes", "garbage"])
