@@ -31,6 +31,7 @@ from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
+from membrane_ctrl.hold.closing_words import Closing
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _run
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
@@ -112,9 +113,12 @@ class Bench:
             async def run() -> Exit:
                 asyncio.get_running_loop().call_later(BREAKS_S, breaks, self)
                 children, clock = cast(ChildProcesses, self.children), cast(RunClock, LoopClock())
-                return await _run(
-                    self.bench, CONFIG, options, clock, rings, children, None, port, latched, BoardAtStart()
+                closing = Closing()
+                await _run(
+                    self.bench, CONFIG, options, clock, rings, children, None, port, latched, BoardAtStart(), closing
                 )
+                assert closing.exit is not None
+                return closing.exit
 
             exit_code = run_virtual(run())
             self.events = [json.loads(message) for message in events.drain()]
