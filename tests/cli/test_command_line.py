@@ -111,8 +111,9 @@ def test_check_finds_an_absent_group(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_setting_that_only_its_driver_refuses_is_named_with_its_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    link = 'driver = "modbus_map"\nlink = "tcp://127.0.0.1:1"\naddress = 0\nvalue = [0.0, 1.0]\n'  # no raw
+    link = 'driver = "modbus_map"\nlink = "tcp://127.0.0.1:1"\nvalue = [0.0, 1.0]\n'  # no raw
     path = tmp_path / "lab.toml"
-    path.write_text("".join(f"[devices.{role}]\n{link}" for role in ("displacement", "gauge_pressure", "pump")))
+    roles = enumerate(("displacement", "gauge_pressure", "pump"))
+    path.write_text("".join(f"[devices.{role}]\n{link}address = {address}\n" for address, role in roles))
     assert cli.run(["safe", str(path)]) == Exit.BAD_INPUT
     assert re.fullmatch(rf"membrane-ctrl: {path}: devices\.\w+: raw is missing.*\n", capsys.readouterr().err)

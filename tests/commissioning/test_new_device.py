@@ -146,7 +146,8 @@ def configured(**keys: object) -> Config:
     """A configuration whose gauge is `acme_gauge`, with these keys as well."""
     modbus = {"driver": "modbus_map", "link": "tcp://h", "address": 0, "raw": [0.0, 1.0], "value": [0.0, 1.0]}
     gauge = {"driver": "external", "name": "acme_gauge", "port": "/dev/ttyX", **keys}
-    return Config.model_validate({"devices": {"displacement": modbus, "pump": modbus, "gauge_pressure": gauge}})
+    pump = {**modbus, "address": 1}
+    return Config.model_validate({"devices": {"displacement": modbus, "pump": pump, "gauge_pressure": gauge}})
 
 
 def refusal(**keys: object) -> str:
