@@ -18,7 +18,9 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 Client = tuple[str, int]
 
-STRANGERS_MAX = 256
+# More than the kernel hands over at once (uvicorn's backlog of 2048), so that a viewer's new connection is not ended
+# by others of the same moment, before its request is read. Each takes some 20 kB.
+STRANGERS_MAX = 2500
 REQUEST_S = 10.0  # from the first byte of a request, or from the connection, to its last byte
 HEAD_BYTES_MAX = 32_768
 _FILES_WANTED = 65_536
@@ -137,12 +139,13 @@ class GuardedHttp(HttpToolsProtocol):
         self.transport.close()
 
 
-def raise_file_limit() -> None:
-    """Let the process open as many files as its hard limit admits, so that places are what runs out first."""
+def raise_file_limit() -> int:
+    """Let the process open as many files as its hard limit admits; returns the places for half of them."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _FILES_WANTED if hard == resource.RLIM_INFINITY else min(hard, _FILES_WANTED)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    return min(STRANGERS_MAX, wanted // 2)
 
 
 class PageLoop(asyncio.SelectorEventLoop):

@@ -61,10 +61,9 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     accounts = accounts_of(page)
     require_servable(page)
     os.nice(max(0, _NICE - os.nice(0)))
-    raise_file_limit()
     address = public_address(page)
     feeds = {name: HoldFeed(where) for name, where in holds.items()}
-    guard = ConnectionGuard()
+    guard = ConnectionGuard(raise_file_limit())
     build_inside = app.build_middleware_stack
 
     def build_middleware_stack() -> ASGIApp:

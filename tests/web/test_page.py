@@ -115,6 +115,7 @@ async def test_a_viewer_sees_all_locks_and_types_the_word_of_one(tmp_path: Path)
         for part in ("unix:ann", "page:bob", "bofa0", "bofa1", "Type the word"):
             assert part in dialog
         assert await tab.value("document.querySelector('.q-dialog input').value") == "", "a person types the word"
+        await tab.until("document.activeElement.tagName === 'INPUT'")
         await tab.press(*"bofa1")
         await tab.value(press.format("do it"))
         await tab.until("document.body.innerText.includes('unlock: done')")
