@@ -57,8 +57,10 @@ async def serve(config: MqttConfig, door: Door) -> None:
         pass  # a connection would time out meanwhile
     while True:
         began_s = time.monotonic()
+        connection = asyncio.create_task(_serve_connection(broker, config, door, ownership), name="mqtt connection")
+        await _wait_for_end(connection)
         try:
-            await _serve_connection(broker, config, door, ownership)
+            connection.result()
         except* (aiomqtt.MqttError, OSError) as group:
             reasons = _leaves(group)
             broker.note_failure(reasons)
@@ -67,11 +69,19 @@ async def serve(config: MqttConfig, door: Door) -> None:
                 reason = "; ".join(dict.fromkeys(map(str, reasons)))
                 print(f"mqtt: {broker.where}: {reason}; trying again", file=sys.stderr, flush=True)
             printed = True
-        # An error of a connection that is being closed takes the place of the cancellation that closes it.
-        task = asyncio.current_task()
-        if task is not None and task.cancelling():
-            raise asyncio.CancelledError
         await asyncio.sleep(_AGAIN_S)
+
+
+async def _wait_for_end(connection: asyncio.Task[None]) -> None:
+    """Wait for the end of a connection; a cancellation ends it, whatever errors its closing brings about."""
+    try:
+        await asyncio.wait({connection})
+    except asyncio.CancelledError:
+        connection.cancel()
+        await asyncio.wait({connection})
+        if not connection.cancelled():
+            connection.exception()
+        raise
 
 
 def _leaves(group: BaseExceptionGroup[BaseException]) -> list[BaseException]:
