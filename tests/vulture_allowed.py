@@ -18,7 +18,7 @@ _.power_cycle, _.set_double  # faults that scenarios and tests bring about
 _.__signature__  # Typer reads a command's options from it
 _.expect  # of a scenario: its tests
 _.__init_subclass__  # Python calls it
-_.priority, _.overdue_s, _.restarts, _.sent, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
+_.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
 _.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregularity_rms_um  # numbers of a figure,
 _.pvr_um, _.rotational_pv_um, _.asymmetry_rms_um, _.slope_rms_urad  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
