@@ -254,8 +254,21 @@ def check(message: Message, model: type[BaseModel]) -> Message:
     return message
 
 
+# Short words for the kinds of problems that pydantic names.
+_PROBLEMS = {
+    "missing": "missing",
+    "string_pattern_mismatch": "not a name",
+    "string_type": "not a text",
+    "float_type": "not a number",
+    "int_type": "not a whole number",
+    "bool_type": "neither true nor false",
+    "dict_type": "not a table",
+    "model_type": "not a table",
+}
+
+
 def _described(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_input=False, include_context=False)[0]
     field = ".".join(str(part) for part in first["loc"])
-    problem = "missing" if first["type"] == "missing" else first["msg"][:1].lower() + first["msg"][1:]
+    problem = _PROBLEMS.get(first["type"]) or first["msg"][:1].lower() + first["msg"][1:]
     return terminal.one_line(f"{field[:_QUOTED_MAX]}: {problem}"[: 2 * _QUOTED_MAX])

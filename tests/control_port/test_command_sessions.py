@@ -54,11 +54,12 @@ async def test_a_second_session_of_the_same_user_is_refused_with_the_first_ones_
 
 async def test_a_session_has_command_for_longer_than_single_commands_last(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        first, second = await call(client_of, run), await call(client_of, run)
-        await call(first.ask, do="claim", text="tune")
+        first = await call(client_of, run)
+        await call(first.ask, do="claim", text="tune morning")
         run.now_s += 1e5
-        assert "tune" in (await call(second.ask, do="setpoint", value=1.0))["refused"]
-        assert (await call(first.ask, do="setpoint", value=1.0))["ok"]
+        second = await call(client_of, run)
+        assert "tune morning" in (await call(second.ask, do="setpoint", value=1.0))["refused"]
+        assert (await call(second.status))["status"]["command_session"]["what"] == "tune morning"
         first.close()
         second.close()
 

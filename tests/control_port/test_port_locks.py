@@ -22,8 +22,8 @@ from membrane_ctrl.model.events import LockRemoved, LockSet
 from membrane_ctrl.model.run_events import LockNotStored, LockStored
 from membrane_ctrl.model.telemetry import RunStatus
 
-HOLD = Peer("unix:membrane", "tune", "process 1", is_own_user=True)
-ANN = Peer("unix:ann", "operate", "process 2")
+HOLD = Peer("unix:membrane", "tune", 1, is_own_user=True)
+ANN = Peer("unix:ann", "operate", 2)
 BEHALF = {"via": "page", "account": "bob", "name": "bob", "session": "page 1f", "role": "operate"}
 
 
