@@ -55,6 +55,7 @@ async def bridge(folder: Path, role: str = "operate", **settings: object) -> Asy
     """A run with an OPC UA bridge; yields the run and the server's address."""
     port = free_port()
     seen = dataclasses.replace(seen_hold(), name="the-run", seen_s=time.monotonic() + 1e6)
+    asyncio.get_running_loop().set_debug(False)  # which makes a call ten times as slow
     async with port_run(folder) as run:
         door = door_with(role, seen, folder / "control.sock")
         config = OpcuaConfig(port=port, **settings)  # type: ignore[arg-type]
@@ -119,7 +120,6 @@ async def test_a_safety_command_behind_a_flood_of_calls_is_answered_within_a_sec
 ) -> None:
     async with bridge(tmp_path) as (run, url), client_of(url) as client:
         _, space = await mirror_of(client)
-        asyncio.get_running_loop().set_debug(False)  # which makes a call ten times as slow
         flood = [asyncio.create_task(answer_to(client, call_of(space, "shape_on"))) for _ in range(150)]
         begin_s = time.monotonic()
         safe = asyncio.create_task(answer_to(client, call_of(space, kind, *text_for(kind))))
