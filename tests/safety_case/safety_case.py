@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 for folder in (ROOT / "tests" / "mutants", ROOT):
     sys.path.insert(0, str(folder))  # it is run as a script, and imported by a test
 
-from mutants import Verdict, current_verdicts, load  # noqa: E402
+from mutants import Verdict, current_verdicts, load, removes  # noqa: E402
 
 from firmware_iface.register_map import default_map  # noqa: E402
 from membrane_ctrl.controller.protection import Guard  # noqa: E402
@@ -29,7 +29,6 @@ from membrane_ctrl.controller.safety import TABLE, Rule  # noqa: E402
 SOURCE = Path(__file__).with_name("safety_case.toml")
 DOCUMENT = ROOT / "docs" / "safety-case.md"
 OPERATIONS = ROOT / "docs" / "operations.md"
-SAFETY = ROOT / "membrane_ctrl" / "controller" / "safety.py"
 _RULES = {rule.name: rule for rule in TABLE}
 
 
@@ -76,24 +75,12 @@ def load_case() -> SafetyCase:
     return SafetyCase(losses, {hazard["id"]: hazard for hazard in table["hazard"]}, constraints)
 
 
-def _rule_of(verdict: Verdict) -> str:
-    """The rule of the safety table in whose row the mutation is; empty if it is elsewhere."""
-    text = SAFETY.read_text(encoding="utf-8")
-    place = text.find(verdict.mutant.find)
-    if place < 0:
-        return ""
-    end = place + len(verdict.mutant.find)
-    rows = [match for match in re.finditer(r'code=\d+, name="(\w+)"', text) if match.start() < end]
-    inside = place < text.index("# fmt: on")
-    return rows[-1][1] if rows and inside else ""
-
-
 @cache
 def find_killed() -> dict[str, list[Verdict]]:
     """The mutations that fast tests kill, by the rule or guard that they remove."""
     killed: dict[str, list[Verdict]] = {}
     for verdict in current_verdicts(load()[0]):
-        name = verdict.mutant.guard or _rule_of(verdict)
+        name = removes(verdict.mutant)
         if verdict.by_tests and name:
             killed.setdefault(name, []).append(verdict)
     return killed
