@@ -48,13 +48,22 @@ class Cell:
     def lasts_s(self) -> float:
         """How long it is followed: a drift that takes hours in a hold, everything else for minutes."""
         undertaking = Undertaking(self.undertaking)
-        slow = any(BY_WORDS[words].slow for words in self.failures)
-        if slow and undertaking is Undertaking.HOLD and len(self.failures) == 1:
+        if undertaking is Undertaking.HOLD and len(self.failures) == 1 and self._drifts_slowly():
             return DRIFT_S
         activity = undertaking.activity
         if activity in (Activity.PAUSE, Activity.MANUAL):
             return PAUSE_S
         return TUNE_S if activity is Activity.TUNE else HOLD_S
+
+    def _drifts_slowly(self) -> bool:
+        """Whether a sensor that the process value follows drifts for hours; a gauge's drift is the same in all."""
+        failure = BY_WORDS[self.failures[0]]
+        followed = {
+            ProcessValue.LASER: {FilmSensor.LASER, FilmSensor.GAUGE},
+            ProcessValue.ESTIMATE: {FilmSensor.LASER, FilmSensor.OPTICS},
+            ProcessValue.OPTICS: {FilmSensor.OPTICS},
+        }
+        return failure.slow and failure.sensor in followed[ProcessValue(self.process_value)]
 
 
 def is_possible(value: ProcessValue, failure: SensorFailure) -> bool:

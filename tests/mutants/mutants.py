@@ -322,8 +322,8 @@ def document(verdicts: Sequence[Verdict], listed: int) -> str:
         "days; the list holds the ways in which each decision about gas can be wrong.",
         "",
         (f"{listed} mutations are listed" if total == listed else f"{total} of {listed} were examined")
-        + f". **Fast tests kill {tests} of {total} ({100 * tests / max(total, 1):.0f} %), the campaign alone {campaign} of "
-        f"{of_campaign} ({100 * campaign / max(of_campaign, 1):.0f} %)**, drawn at random.",
+        + f". **Fast tests kill {tests} of {total} ({100 * tests / max(total, 1):.0f} %), the campaign alone kills "
+        f"{campaign} of {of_campaign} ({100 * campaign / max(of_campaign, 1):.0f} %).**",
         "",
         "The fast tests are those of control and devices, without the campaign, the real-time tests and the "
         f"comparisons of generated documents ({', '.join(f'`{name}`' for name in COMPARISONS)}). The campaign is its "
