@@ -166,6 +166,7 @@ def test_a_lost_signal_is_open_once_its_last_answer_is_old_and_closed_when_it_is
         source.error = None
         await asyncio.sleep(2 * PERIOD_S)
         assert await open_mask(bench) == 0
+        assert source.opened == (2 if isinstance(error, roles.LinkDownError) else 1)
         await bench.close()
 
     in_virtual_time(test)
