@@ -97,6 +97,7 @@ class CentreFilter:
         self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
         self._transit.place(flow_um_per_s)
         self._jumped: list[str] = []
+        self._jumped_sensors: list[Sensor] = []
         self._judged = True
         self.frames = 0  # of the optics since lock
         self._frame_interval_s = FRESH_S[Sensor.OPTICS]
@@ -119,7 +120,7 @@ class CentreFilter:
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
         """One tick: predict, then take what was read. `dt_s` must exceed 0."""
-        self._jumped, self._judged = [], given.judged
+        self._jumped, self._jumped_sensors, self._judged = [], [], given.judged
         self._predict(given, dt_s)
         self._clone(given.now_s)
         for watch in self._watches:
@@ -286,6 +287,7 @@ class CentreFilter:
         """A sensor has moved and stays there: let the others say whether it moved, or what it sees."""
         since_s = self._watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
+        self._jumped_sensors.append(sensor)
         moved = _ONE[_GAS] + self._centre_since(since_s)
         if sensor == Sensor.THERMOMETER:
             self._widen(innovation * _ONE[_AIR])
@@ -346,4 +348,5 @@ class CentreFilter:
                 for sensor, watch in zip(Sensor, self._watches, strict=True)
             ),
             jumped=tuple(self._jumped),
+            jumped_sensors=tuple(self._jumped_sensors),
         )

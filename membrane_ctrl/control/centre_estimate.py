@@ -65,8 +65,8 @@ class CentreEstimate:
         Loss of gas, and that less the lift of the warming gas.
     sensors : tuple of SensorView
         By `Sensor`.
-    jumped : tuple of str
-        Sensors whose readings have jumped in this tick, in words.
+    jumped, jumped_sensors : tuple
+        Sensors whose readings have jumped in this tick, in words and as such.
     """
 
     um: float
@@ -78,6 +78,7 @@ class CentreEstimate:
     drift_um_per_s: float
     sensors: tuple[SensorView, ...]
     jumped: tuple[str, ...] = ()
+    jumped_sensors: tuple[Sensor, ...] = ()
 
     def telemetry(self) -> dict[str, float]:
         """What a telemetry row says of it."""

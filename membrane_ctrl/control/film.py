@@ -236,6 +236,8 @@ SLOW_SHARE = 2.0
 CLEARER = 2.0
 # A laser without a reading for this long is not compared; its mean then begins with its next reading.
 LASER_GAP_S = 2.0
+# While the film moves, optics lag behind the laser by a figure or a cycle; the speed is a mean over this.
+SPEED_S = 2.0
 
 
 class Liar(IntEnum):
@@ -273,6 +275,7 @@ class Changes:
 class _Reference:
     """Means of laser, optics and gauge that follow the present ones while laser and optics agree."""
 
+    sag_um: float  # of the mirror at displacement 0
     follow_s: float
     limit_um: float
     laser_um: float = math.nan
@@ -296,28 +299,37 @@ class _Reference:
         self.gauge_pa += share * (means[2] - self.gauge_pa)
 
     def changes(self, means: tuple[float, float, float]) -> Changes:
-        """Changes of sag since the reference."""
-        um_per_pa = means[1] / (3 * means[2])
-        return Changes(means[0] - self.laser_um, means[1] - self.optics_um, um_per_pa * (means[2] - self.gauge_pa))
+        """Changes of sag since the reference; the gauge's by Hencky's law: the sag goes with the cube root."""
+        gauge_um = (self.sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
+        return Changes(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)
 
 
 class PlausibilityCheck:
-    """Judges on every tick; NOBODY without a camera, as two sensors can only disagree.
+    """Judges on every tick, also while the film moves; NOBODY without a camera, as two sensors can only disagree.
 
     Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`) within minutes, and `SLOW_SHARE` times as
     much within a quarter of an hour; there only the camera is found wrong, for a laser's mount that drifts so slowly
     is what the camera corrects. `changes` are NaN until there is a reference.
+
+    Parameters
+    ----------
+    limit_um : float
+    sag_um : float
+        Of the mirror at displacement 0, by which a change of pressure is a change of sag.
+    figure_lag_s : float
+        By how much a figure may be older than the laser's reading of the same tick.
     """
 
-    def __init__(self, limit_um: float) -> None:
-        self._limit_um = limit_um
+    def __init__(self, limit_um: float, sag_um: float, figure_lag_s: float = 0.0) -> None:
+        self._limit_um, self._sag_um, self._figure_lag_s = limit_um, sag_um, figure_lag_s
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the mirror is not held."""
         self._laser, self._gauge, self._optics = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
-        self._fast = _Reference(REFERENCE_S, self._limit_um)
-        self._slow = _Reference(SLOW_REFERENCE_S, SLOW_SHARE * self._limit_um)
+        self._fast = _Reference(self._sag_um, REFERENCE_S, self._limit_um)
+        self._slow = _Reference(self._sag_um, SLOW_REFERENCE_S, SLOW_SHARE * self._limit_um)
+        self._speed_um_per_s = LowPass(SPEED_S)
         self._age_s, self._readings = 0.0, 0
         self._figure_s = math.nan
         self._laser_gap_s = 0.0
@@ -374,7 +386,13 @@ class PlausibilityCheck:
         if self._laser_gap_s > LASER_GAP_S:
             self._laser = LowPass(SMOOTH_S, early_mean=True)
         self._laser_gap_s = 0.0
-        self._laser.update(displacement_um, dt_s)
+        mean_um = self._laser.update(displacement_um, dt_s)
+        self._speed_um_per_s.update((displacement_um - mean_um) / SMOOTH_S, dt_s)
+
+    @property
+    def _lag_um(self) -> float:
+        """By how much optics may lag behind the laser because the film moves."""
+        return self._figure_lag_s * abs(self._speed_um_per_s.value)
 
     def _judge(self, means: tuple[float, float, float], dt_s: float) -> None:
         if not _known(self._age_s, self._readings):
@@ -386,7 +404,7 @@ class PlausibilityCheck:
             # The verdict stands until the two clearly agree again: a drifting gauge must not accuse the other.
             judged = self._slow if self._slow_wrong else self._fast
             self.changes = changes = judged.changes(means)
-            if abs(changes.laser_um - changes.optics_um) <= judged.limit_um / 2:
+            if abs(changes.laser_um - changes.optics_um) <= judged.limit_um / 2 + self._lag_um:
                 self.liar, self._slow_wrong = Liar.NOBODY, False
         else:
             self._judge_fast(means)
@@ -399,12 +417,12 @@ class PlausibilityCheck:
     def _judge_fast(self, means: tuple[float, float, float]) -> None:
         self.changes = changes = self._fast.changes(means)
         limit_um = self._limit_um if self.liar == Liar.NOBODY else self._limit_um / 2  # and back only when clearly so
-        agree = abs(changes.laser_um - changes.optics_um) <= limit_um
+        agree = abs(changes.laser_um - changes.optics_um) <= limit_um + self._lag_um
         self.liar = Liar.NOBODY if agree else changes.judge()
 
     def _judge_slowly(self, means: tuple[float, float, float]) -> None:
         """Find a camera that drifts slowly; a laser's slow drift is its mount's, and is corrected."""
         changes = self._slow.changes(means)
-        apart = abs(changes.laser_um - changes.optics_um) > self._slow.limit_um
+        apart = abs(changes.laser_um - changes.optics_um) > self._slow.limit_um + self._lag_um
         if apart and changes.judge() == Liar.OPTICS:
             self.liar, self.changes, self._slow_wrong = Liar.OPTICS, changes, True

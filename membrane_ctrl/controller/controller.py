@@ -125,6 +125,7 @@ class Controller:
         events += self._holders.step(inputs, self.state, scene, last, shape.state, consistency)
         if (estimate := self._holders.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
+        scene.laser_doubted = bool(consistency.laser_lies)
         scene.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
         if math.isnan(self._state_since_s):  # the verdict has just changed the state
             self._state_since_s, scene.state_age_s = inputs.now_s, 0.0

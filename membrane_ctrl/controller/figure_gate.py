@@ -19,6 +19,8 @@ _JUMPED = 5  # figures in a row that no film can show; one or two are bad figure
 _REPEATS = 3  # no two figures have the same noise
 # Compiling on a slow machine, and the self-test of screen and camera.
 _CAMERA_STARTS_S = 900.0
+# The configured sag is known within this factor; a wrong unit or sign is further off.
+_SAG_FACTOR = 2.0
 # The optics' zero against the laser's reading is a mean over this: a mount at 2 um/min is 2 um ahead of it.
 _ALIGN_S = 60.0
 
@@ -29,6 +31,7 @@ class FigureDefect(Enum):
     REJECTED = "it was rejected"
     ANCHOR = "it has only been anchored"
     NOT_FINITE = "it is not finite"
+    OTHER_MIRROR = "its sag is not this mirror's"
     SIGMA = "its standard deviation is unusable"
     TIME = "its time is wrong"
     JUMP = "the sag jumped"
@@ -62,6 +65,7 @@ class FigureGate:
     def __init__(self, config: Config) -> None:
         self._tracks = config.shape.mode == "track"
         self._by_optics = config.by_optics
+        self._sag_um = 1e3 * config.optics.mirror.sag_mm
         self._loop_age_s = max(_LOOP_AGE_S, _LOOP_INTERVALS / config.shape.track_rate_hz) if self._tracks else 0.0
         self._guard_age_s = self._loop_age_s if config.by_optics else _GUARD_AGE_S
         # A figure less certain than the band cannot hold the mirror within it.
@@ -101,6 +105,8 @@ class FigureGate:
             return FigureDefect.ANCHOR
         if not math.isfinite(figure.sag_um):
             return FigureDefect.NOT_FINITE
+        if not self._sag_um / _SAG_FACTOR <= figure.sag_um <= _SAG_FACTOR * self._sag_um:
+            return FigureDefect.OTHER_MIRROR
         if not 0.0 <= figure.sag_sigma_um <= self._sigma_max_um:
             return FigureDefect.SIGMA
         if not figure.time_s <= now_s or figure.time_s <= self._newest_s:

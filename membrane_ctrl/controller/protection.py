@@ -95,7 +95,7 @@ _TIMES: Mapping[Activity, _Keepers] = {
     Activity.TUNE: (Guard.EXPERIMENT_TIME,),
 }
 _DEPTHS: _Keepers = ("over_displacement", "under_displacement")
-_HELD = frozenset({Activity.SETTLE, Activity.HOLD, Activity.PAUSE})
+_COMPARED = frozenset(Activity) - {Activity.INFLATE}
 
 
 def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) -> _Keepers:
@@ -110,7 +110,8 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
     Returns
     -------
     tuple of str or Guard
-        Empty only for `MAJORITY` and `GAS`, which need a mirror that stands, and a third sensor.
+        Empty only for `MAJORITY`, which needs a third sensor and a mirror that is not far from its setpoint, and for
+        `GAS`, which needs a mirror that is held.
     """
     uses_laser = process_value is not ProcessValue.OPTICS
     uses_optics = process_value is not ProcessValue.LASER
@@ -136,7 +137,7 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
         case Duty.GAUGE:
             return ("laser_gauge_apart", Guard.DRIFT_NOTICE)
         case Duty.MAJORITY:
-            if activity not in _HELD or not uses_laser:
+            if activity not in _COMPARED or not uses_laser:
                 return ()
             return (
                 Guard.PLAUSIBILITY,

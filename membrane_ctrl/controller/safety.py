@@ -16,7 +16,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 HOLDING = frozenset({State.HOLD})
-STANDING = HOLDING | {State.SETTLE}  # the mirror is at its setpoint
+ESTIMATED = MOVING - {State.INFLATE}  # laser, optics and gauge are compared
 CONNECTED = MOVING | {State.CHECK}
 GAS_MOVES = CONNECTED | {State.LOWER}
 ALWAYS = frozenset(State)
@@ -238,7 +238,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=14, name="laser_implausible", cause="camera and gauge agree that the laser is wrong",
-        limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=STANDING,
+        limit="shape.disagreement_max_um", safe_level=SafeLevel.HOLD_FLOW, states=ESTIMATED,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and `ctl shape on`",
         seen=lambda o: o.laser_lies, broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
     ),

@@ -50,6 +50,7 @@ class Scene:
     dt_s: float = 0.02
     state_age_s: float = 0.0  # 0 exactly in the first tick of a state
     trim_um: float = 0.0
+    laser_doubted: bool = False  # optics and gauge contradict it
     estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
     # requests
     hold_wanted: bool = False

@@ -59,6 +59,17 @@ def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) ->
     )
 
 
+# A figure is made of frames of up to a cycle ago, and takes this long to compute and arrive.
+_FIGURE_TAKES_S = 0.5
+
+
+def _find_figure_lag_s(config: Config) -> float:
+    """By how much a figure may be older than the laser's reading of the same tick."""
+    shape = config.shape
+    interval_s = 1 / shape.track_rate_hz if shape.mode == "track" else shape.period_s
+    return interval_s + _FIGURE_TAKES_S
+
+
 class SensorConsistency:
     """Consulted on every tick, before safety judges.
 
@@ -73,7 +84,9 @@ class SensorConsistency:
     """
 
     def __init__(self, config: Config) -> None:
-        self._plausibility = film.PlausibilityCheck(config.shape.disagreement_max_um)
+        self._plausibility = film.PlausibilityCheck(
+            config.shape.disagreement_max_um, 1e3 * config.optics.mirror.sag_mm, _find_figure_lag_s(config)
+        )
         self._far_um = config.shape.disagreement_max_um
         self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump))
         self._pump = film_health.PumpHealth(config.pump.change_max)
@@ -110,8 +123,12 @@ class SensorConsistency:
         self._compare_with_gauge(state, dt_s, held)
         events = self._doubt_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
-        if state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um:
+        if state not in safety.ESTIMATED:
             return events + self._rest()
+        moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
+        if moves:
+            self._growth.moves()
+            self.gas_excess = ""
         self._look_at_camera(held.figure)
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self._camera_s <= self._fresh_s
@@ -122,7 +139,7 @@ class SensorConsistency:
             self._plausibility.reset()
             liar = film.Liar.NOBODY
         events += self._judge(liar)
-        if state == State.SETTLE:
+        if moves or state == State.SETTLE:
             return events
         self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
         events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
@@ -278,38 +295,43 @@ def _of_warning(warning: film_health.FilmWarning) -> Event:
     return (Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message)
 
 
-# in `inflate` the film's gain may still be another one
-_ESTIMATED = frozenset({State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
 _STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
 _STANDS_S = 1.5  # a sensor that comes and goes within this, as a slower camera does at first, is not reported
+
+
+_JUMP_TAKES_S = 2.0  # until the estimate has followed a jump of the laser
 
 
 class MountDrift:
     """How far the estimate lets the laser's mount drift: as far as the shape loop's trim, `shape.trim_max_um`.
 
     Laser and optics that drift apart do not show which of them drifts. Beyond the limit the optics are left out, the
-    mirror follows the laser, and a person decides. A knock, which the estimate follows at once, is no drift.
+    mirror follows the laser, and a person decides. A jump that the estimate found to be the laser's is no drift.
     """
 
     def __init__(self, shape: ShapeConfig) -> None:
-        self._most_um, self._rate_um_per_s = shape.trim_max_um, shape.trim_rate_max_um_per_s
+        self._most_um = shape.trim_max_um
         self.start(0.0)
 
     def start(self, mount_um: float) -> None:
         """Count from a place of the mount, in um."""
-        self._mount = LowPass(film.SMOOTH_S)
-        self._mount.reset(mount_um)
+        self._last_um = mount_um
         self._drift_um = 0.0
+        self._jump_left_s = 0.0
         self.beyond_limit = False
 
-    def step(self, mount_um: float, dt_s: float) -> list[Event]:
-        """Follow the mount; returns the notice once the limit is passed, which only `start` takes back."""
+    def step(self, mount_um: float, laser_jumped: bool, dt_s: float) -> list[Event]:
+        """Follow the mount; returns the notice once the limit is passed, which only `start` takes back.
+
+        `laser_jumped`: the estimate has found in this tick that the laser has jumped.
+        """
+        moved_um = mount_um - self._last_um
+        self._last_um = mount_um
         if self.beyond_limit:
             return []
-        before_um = self._mount.value
-        moved_um = self._mount.update(mount_um, dt_s) - before_um
-        most_um = self._rate_um_per_s * dt_s  # of a drift; what moves faster is a knock
-        self._drift_um += min(max(moved_um, -most_um), most_um)
+        self._jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, self._jump_left_s - dt_s)
+        if self._jump_left_s == 0.0:
+            self._drift_um += moved_um
         self.beyond_limit = abs(self._drift_um) > self._most_um
         if not self.beyond_limit:
             return []
@@ -361,7 +383,7 @@ class Holders:
         """One tick, after the sensors were judged; returns what is news."""
         flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
         figures = scene.observer.figures
-        if not self._wanted or state not in _ESTIMATED or not math.isfinite(flow_um_per_s):
+        if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
             self.estimate, self._running, self._told = None, False, None
             return []
         laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
@@ -399,7 +421,8 @@ class Holders:
         self.estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = self.estimate.mount_um
         news = [*self._news(inputs.now_s, self.estimate.jumped), *self._told_of_stand()]
-        news += self._mount_drift.step(self.estimate.mount_um, scene.dt_s)
+        laser_jumped = Sensor.LASER in self.estimate.jumped_sensors
+        news += self._mount_drift.step(self.estimate.mount_um, laser_jumped, scene.dt_s)
         if self._sees(Sensor.OPTICS):
             sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
             self.estimate = replace(self.estimate, sigma_um=sigma_um)

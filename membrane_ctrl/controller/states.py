@@ -140,7 +140,8 @@ def tune(scene: Scene) -> State:
     trial = scene.trial
     assert trial is not None  # made by the command that leads here
     given = _given(scene, scene.setpoint_um)
-    seen_um = given.displacement_um if scene.config.by_optics else scene.observer.moving_laser_um
+    measuring_um = math.nan if scene.laser_doubted else scene.observer.moving_laser_um
+    seen_um = given.displacement_um if scene.config.by_optics else measuring_um
     if scene.config.by_optics and given.estimate is not None and math.isfinite(seen_um):
         seen_um = given.estimate.um  # a figure is of a moment ago
     measurement = BenchSample(seen_um, given.ambient_pressure_pa, given.air_temperature_c)

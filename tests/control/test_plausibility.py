@@ -26,7 +26,7 @@ def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate
 def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0) -> list[Liar]:
     """The verdict on every tick of a story; noise 1 um, 1 um and 0.5 Pa."""
     rng = np.random.default_rng(seed)
-    judge, said = PlausibilityCheck(10.0), []
+    judge, said = PlausibilityCheck(10.0, 37_100.0), []
     for tick in range(round(duration_s * RATE_HZ)):
         time_s = tick / RATE_HZ
         true_um, laser_um, camera_um = story(time_s)
@@ -85,7 +85,7 @@ def test_a_gauge_that_drifts_off_accuses_nobody_falsely() -> None:
 
 
 def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
-    judge = PlausibilityCheck(10.0)
+    judge = PlausibilityCheck(10.0, 37_100.0)
     for tick in range(2000):
         assert judge.step(0.1, 500.0 * (tick > 1000), 600.0, None) == Liar.NOBODY
         assert judge.step(0.1, 500.0 * (tick > 1000), math.nan, estimate(tick * 0.1, SAG_UM)) == Liar.NOBODY
@@ -93,7 +93,7 @@ def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
 
 
 def test_a_rejected_shape_is_no_evidence() -> None:
-    judge = PlausibilityCheck(10.0)
+    judge = PlausibilityCheck(10.0, 37_100.0)
     for tick in range(3000):
         bad = estimate(tick * 0.1, SAG_UM + 500.0, "rejected") if tick % 20 == 10 else None
         good = estimate(tick * 0.1, SAG_UM) if tick % 20 == 0 else None
@@ -108,7 +108,7 @@ def shown(judge: PlausibilityCheck, time_s: float, laser_um: float, camera_um: f
 
 def settled(laser_um: float, camera_um: float, gauge_um: float) -> tuple[PlausibilityCheck, float]:
     """A monitor after a minute without error and a minute of this."""
-    judge, time_s = PlausibilityCheck(10.0), 0.0
+    judge, time_s = PlausibilityCheck(10.0, 37_100.0), 0.0
     for _ in range(60):
         time_s += 1.0
         shown(judge, time_s, 0.0, 0.0, 0.0)

@@ -13,7 +13,7 @@ from membrane_ctrl.controller.safety import MOVING, TABLE
 
 RULES = {rule.name: rule for rule in TABLE}
 CELLS = list(product(ProcessValue, Activity, Duty))
-# Two sensors against one need a mirror that stands still and both of them; excess gas needs a mirror held long.
+# Two sensors against one need a third sensor and a film near its working point; excess gas a mirror held long.
 NOT_EVERYWHERE = {Duty.MAJORITY, Duty.GAS}
 
 

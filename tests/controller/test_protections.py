@@ -297,3 +297,65 @@ def test_a_hold_inflates_again_by_the_optics_after_manual_flow() -> None:
     assert held.state == State.HOLD
     assert held.ticks[-1].row.safe_level == SafeLevel.NONE
     assert abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 2.0
+
+
+def stepping(um: float) -> Spoil:
+    return lambda since_s, figure: replace(figure, sag_um=figure.sag_um + um)
+
+
+RELAY = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
+UNDERTAKINGS = {
+    "hold": Command("mark", "a test", text="nothing"),
+    "setpoint": Command("setpoint", "a test", value=40.0),
+    "tune": Command("tune", "a test", experiment=RELAY),
+    "manual": Command("manual", "a test", value=1.24),
+    "pause": Command("pause", "a test"),
+}
+
+
+@pytest.mark.parametrize("spoil", [drifting(-5.0), drifting(1.0), stepping(-150.0), stepping(30.0)])
+@pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
+def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoil: Spoil) -> None:
+    """Laser and gauge are sound; without a comparison while the film moves the loop follows the optics."""
+    held = Bench(config_of("estimate"), spoil)
+    held.command(UNDERTAKINGS[undertaking])
+    held.fail(90.0)
+    assert "optics" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    way_um = 40.0 if undertaking == "setpoint" else 0.0
+    moved_um = np.array([tick.row.truth_displacement_um for tick in held.ticks]) - held.start_um
+    assert moved_um.max() < way_um + 25.0
+    assert moved_um.min() > -25.0
+    assert held.faults == []
+
+
+@pytest.mark.parametrize("process_value", ["laser", "estimate"])
+def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
+    held = Bench(config_of(process_value))
+    held.command(UNDERTAKINGS["tune"])
+
+    def drift(wrong: Wrong, since_s: float) -> None:
+        wrong.laser_offset_um = 2.0 * since_s
+
+    held.fail(40.0, drift)
+    assert held.told(ExperimentEnded)
+    assert held.moved_um < 65.0
+
+
+def test_figures_of_another_mirror_count_as_missing() -> None:
+    held = Bench(config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)).fail(20.0)
+    assert held.notices == ["optics_lost"]
+    assert held.moved_um < 2.0
+
+
+@pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
+@pytest.mark.parametrize("shape", [ShapeConfig(mode="track", track_rate_hz=RATE_HZ), ShapeConfig()])
+@pytest.mark.parametrize("process_value", ["laser", "estimate"])
+def test_sound_sensors_contradict_each_other_nowhere(
+    undertaking: str, shape: ShapeConfig, process_value: str
+) -> None:
+    held = Bench(config_of(process_value, shape=shape))
+    held.command(UNDERTAKINGS[undertaking])
+    held.fail(80.0)
+    assert held.told(Plausibility) == []
+    assert held.faults == []
+    assert held.notices == []

@@ -12,11 +12,11 @@ from membrane_ctrl.controller.redundancy import FilmSensor
 from membrane_ctrl.controller.safety import (
     ALWAYS,
     CONNECTED,
+    ESTIMATED,
     GAS_MOVES,
     HOLDING,
     MOVING,
     NOT_YET_FAULT,
-    STANDING,
     TABLE,
     Rule,
 )
@@ -35,7 +35,7 @@ _STATES: tuple[tuple[str, Collection[State]], ...] = (
     ("check, inflate, settle, hold, manual, tune, lower, fault", GAS_MOVES | {State.FAULT}),
     ("inflate, settle, hold, manual, tune", MOVING),
     ("hold", HOLDING),
-    ("settle, hold", STANDING),
+    ("settle, hold, manual, tune", ESTIMATED),
     ("standby, check, lower, fault", ALWAYS - MOVING),
 )
 _LEVELS = {
@@ -103,8 +103,8 @@ def _protections() -> list[str]:
         "",
         "Whatever the loop holds (`estimator.process_value`), each duty is fulfilled wherever gas can move. Numbers",
         "are rules of the table above, letters the guards below; each acts by itself. A dash: two sensors against",
-        "one need a mirror that stands and a third sensor, excess gas needs a mirror that is held. Gains and a pump",
-        "curve on trial change nothing here. (`membrane_ctrl/controller/protection.py`)",
+        "one need a third sensor and a film near its working point, excess gas needs a mirror that is held. Gains",
+        "and a pump curve on trial change nothing here. (`membrane_ctrl/controller/protection.py`)",
         "",
     ]
     lines += [f"- **{letter}**: {guard.value}" for guard, letter in _LETTERS.items()]
