@@ -33,7 +33,7 @@ def live(bench: LiveBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> l
     """The command line on the bench instead of a running hold."""
 
     @contextmanager
-    def link(*_: object) -> Iterator[LiveBench]:
+    def link(*_: object, **__: object) -> Iterator[LiveBench]:
         yield bench
 
     monkeypatch.setattr(command, "live_hold", link)

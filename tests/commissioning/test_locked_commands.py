@@ -45,7 +45,7 @@ class Client:
     def __init__(self, status: dict[str, object]) -> None:
         self._status = status
 
-    def ask(self, **_: object) -> dict[str, object]:
+    def status(self) -> dict[str, object]:
         return {"ok": True, "status": self._status}
 
 

@@ -204,7 +204,7 @@ class Hold:
 
     def _serve(self) -> None:
         with self._listener, self._listener.accept()[0] as connection, connection.makefile("rwb") as lines:
-            lines.write(b'{"membrane_ctrl": 1, "run": "night"}\n')
+            lines.write(b'{"membrane_ctrl": 1, "run": "night", "you": "unix:ann", "role": "tune"}\n')
             lines.flush()
             request = json.loads(lines.readline())
             self.asked.append(request)

@@ -184,7 +184,9 @@ def serve_once(path: Path, run: str, answer: dict[str, object]) -> tuple[threadi
 
     def serve() -> None:
         with listener, listener.accept()[0] as client, client.makefile("rwb") as lines:
-            lines.write(json.dumps({"membrane_ctrl": 1, "run": run}).encode() + b"\n")
+            lines.write(
+                json.dumps({"membrane_ctrl": 1, "run": run, "you": "unix:ann", "role": "tune"}).encode() + b"\n"
+            )
             lines.flush()
             if line := lines.readline():
                 taken.append(json.loads(line))

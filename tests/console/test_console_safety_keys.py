@@ -8,7 +8,7 @@ from pathlib import Path
 
 from membrane_ctrl.console.keys import sender
 
-GREETING = b'{"membrane_ctrl": 1, "run": "the-run"}\n'
+GREETING = b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
 
 
 def test_a_stop_is_sent_while_another_key_waits_for_its_answer(tmp_path: Path) -> None:

@@ -36,12 +36,12 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
         assert "latch: no answer from the hold within 0.9 s; still being sent" in await door.ask("mqtt", "latch")
         assert time.monotonic() - begin_s < 1.0
         waiting, _ = frozen.accept()  # the hold goes on
-        waiting.sendall(b'{"membrane_ctrl": 1, "run": "the-run"}\n')
+        waiting.sendall(b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n')
         waiting.settimeout(1.0)
         assert waiting.recv(1000) == b"", "the hold command is not sent any more"
         waiting.close()
         latching, _ = frozen.accept()
-        latching.sendall(b'{"membrane_ctrl": 1, "run": "the-run"}\n')
+        latching.sendall(b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n')
         latching.settimeout(5.0)
         assert b'"do": "latch"' in await asyncio.to_thread(latching.recv, 1000)
         latching.close()

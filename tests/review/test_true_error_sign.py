@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.nights import CONFIG, night, write_run
-from membrane_ctrl.hold.start import _headline
+from membrane_ctrl.hold.closing_words import _headline
 from membrane_ctrl.model.telemetry import COLUMN, Rows, columns, true_error_um
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table, verdict
