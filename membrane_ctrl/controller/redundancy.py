@@ -2,23 +2,15 @@
 
 import math
 from collections.abc import Collection, Mapping
-from enum import Enum
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.controller.protection import Failure, FilmSensor, ProcessValue, find_bound
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 
 # A sensor that comes and goes within this, as a laser behind a waving hand does, is not reported.
 LOST_S = 2.0
 # A notice ends once the sensor has stayed this long.
 BACK_S = 10.0
-
-
-class FilmSensor(Enum):
-    """The sensors that show where the film is; the value is what people call them."""
-
-    LASER = "laser"
-    OPTICS = "optics"
-    GAUGE = "gauge"
 
 
 class RedundancyWatch:
@@ -28,74 +20,91 @@ class RedundancyWatch:
     """
 
     def __init__(self, config: Config) -> None:
-        limits = config.limits
-        self._bound = (
-            f"{limits.laser_gauge_apart_max_um:g} um within minutes, {limits.laser_gauge_drift_max_um:g} um within "
-            f"an hour, {limits.laser_gauge_day_max_um:g} um within a day"
-        )
-        # The optics take their time: a cycle that is rejected must not raise a notice.
-        by_laser = config.estimator.process_value == "laser"
-        self._lost_s = {
-            FilmSensor.LASER: LOST_S,
-            FilmSensor.OPTICS: LOST_S + (config.shape.fresh_s if by_laser else 0.0),
-            FilmSensor.GAUGE: LOST_S,
-        }
+        self._config = config
+        self._process_value = ProcessValue(config.estimator.process_value)
+        optics_lost_s = LOST_S
+        if self._process_value is ProcessValue.LASER:
+            # A rejected cycle must not raise a notice: as long as the shape loop uses the last one.
+            optics_lost_s += config.shape.fresh_s
+        self._lost_s = {FilmSensor.LASER: LOST_S, FilmSensor.OPTICS: optics_lost_s, FilmSensor.GAUGE: LOST_S}
         self._forget()
 
     def _forget(self) -> None:
-        self._present_s: dict[FilmSensor, float] = {}  # when each was last present
-        self._returned_s: dict[FilmSensor, float] = {}  # since when a reported one is back
+        self._last_present_s: dict[FilmSensor, float] = {}
+        self._present_again_since_s: dict[FilmSensor, float] = {}
         self._reported: set[FilmSensor] = set()
 
-    def step(self, now_s: float, moving: bool, present: Mapping[FilmSensor, bool]) -> list[Event]:
-        """One tick; `moving`: the pump may be driven, otherwise a loss is no loss of protection.
+    def step(self, now_s: float, pump_may_run: bool, present: Mapping[FilmSensor, bool]) -> list[Event]:
+        """One tick.
+
+        Parameters
+        ----------
+        now_s : float
+        pump_may_run : bool
+            In other states a lost sensor is no loss of protection.
+        present : mapping of FilmSensor to bool
+            Whether each shows the film in this tick.
 
         Returns
         -------
         list of Event
-            `redundancy_lost` once for each loss, and its end.
+            A maintenance notice `laser_lost`, `optics_lost` or `gauge_lost` once for each loss, and its end.
         """
-        if not moving:
-            over = [
-                MaintenanceOver(name_notice(sensor), "the hold has ended") for sensor in sort_sensors(self._reported)
-            ]
-            self._forget()
-            return [*over]
         events: list[Event] = []
+        if not pump_may_run:
+            for sensor in sort_sensors(self._reported):
+                events.append(MaintenanceOver(name_notice(sensor), "the hold has ended"))
+            self._forget()
+            return events
         for sensor, is_present in present.items():
             if is_present:
-                self._present_s[sensor] = now_s
-                events += self._return(sensor, now_s)
+                self._last_present_s[sensor] = now_s
+                events += self._report_return(sensor, now_s)
             else:
-                self._returned_s.pop(sensor, None)
-                events += self._lose(sensor, now_s)
+                self._present_again_since_s.pop(sensor, None)
+                events += self._report_loss(sensor, now_s, present)
         return events
 
-    def _lose(self, sensor: FilmSensor, now_s: float) -> list[Event]:
-        missing_s = now_s - self._present_s.get(sensor, math.nan)
+    def _report_loss(self, sensor: FilmSensor, now_s: float, present: Mapping[FilmSensor, bool]) -> list[Event]:
+        missing_s = now_s - self._last_present_s.get(sensor, math.nan)
         if sensor in self._reported or not missing_s > self._lost_s[sensor]:
             return []
         self._reported.add(sensor)
-        left = [other for other in self._present_s if other not in self._reported]
+        left = [other for other in FilmSensor if present.get(other, False)]
         message = f"the {sensor.value} is lost; {self._describe(left)}. Find out why before another sensor fails"
         return [Maintenance(name_notice(sensor), message)]
 
-    def _return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
+    def _report_return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
         if sensor not in self._reported:
             return []
-        since_s = self._returned_s.setdefault(sensor, now_s)
+        since_s = self._present_again_since_s.setdefault(sensor, now_s)
         if now_s - since_s < BACK_S:
             return []
         self._reported.discard(sensor)
-        del self._returned_s[sensor]
+        del self._present_again_since_s[sensor]
         return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} is back")]
 
-    def _describe(self, left: list[FilmSensor]) -> str:
-        """What still bounds the true displacement."""
-        holders = [sensor.value for sensor in sort_sensors(left) if sensor is not FilmSensor.GAUGE]
-        if FilmSensor.GAUGE in left and holders:
-            return f"{' and '.join(holders)} and gauge are left, and the gauge bounds an error to {self._bound}"
-        return f"only {' and '.join(holders) or 'the gauge'} left, and no other sensor bounds an error"
+    def _describe(self, left: Collection[FilmSensor]) -> str:
+        """What still bounds the true displacement, with the distances of the protection table."""
+        followed = [sensor for sensor in left if sensor is not FilmSensor.GAUGE]
+        if not left:
+            return "no sensor shows the film"
+        if not followed:
+            return "only the gauge is left, and the mean flow is held"
+        if FilmSensor.GAUGE not in left:
+            names = " and ".join(sensor.value for sensor in followed)
+            return f"{names} left, without a gauge"
+        if len(followed) > 1:
+            return "laser, optics and gauge are left"
+        (sensor,) = followed
+        bounds = [
+            find_bound(self._process_value, sensor, failure, self._config, laser_and_optics=False).distance_um
+            for failure in (Failure.STEP, Failure.DRIFT, Failure.DRIFT_WITHIN_CLIMATE)
+        ]
+        return (
+            f"{sensor.value} and gauge are left, and the gauge bounds an error of the {sensor.value} to "
+            f"{bounds[0]:.0f} um within minutes, {bounds[1]:.0f} um within hours, {bounds[2]:.0f} um within days"
+        )
 
 
 def name_notice(sensor: FilmSensor) -> str:

@@ -10,7 +10,8 @@ from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller import safety
-from membrane_ctrl.controller.redundancy import FilmSensor, RedundancyWatch
+from membrane_ctrl.controller.protection import FilmSensor
+from membrane_ctrl.controller.redundancy import RedundancyWatch
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned

@@ -23,8 +23,7 @@ from climate_week import Climate, Week, run_week
 from protection_cells import BY_WORDS, FAILURES, Outcome, SensorFailure, Undertaking, run_cell
 from protection_page import write_page
 
-from membrane_ctrl.controller.protection import Activity, ProcessValue
-from membrane_ctrl.controller.redundancy import FilmSensor
+from membrane_ctrl.controller.protection import Activity, FilmSensor, ProcessValue
 
 RESULTS = Path(__file__).parents[2] / "build" / "protection.jsonl"
 WEEKS = Path(__file__).parents[2] / "build" / "climate.json"

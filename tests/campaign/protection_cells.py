@@ -26,8 +26,7 @@ from membrane_ctrl.config.schema import (
 )
 from membrane_ctrl.control.experiments.trial import ExperimentKind, ExperimentSpec, PumpStep
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.protection import Activity, Failure, ProcessValue
-from membrane_ctrl.controller.redundancy import FilmSensor
+from membrane_ctrl.controller.protection import Activity, Failure, FilmSensor, ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance, Plausibility
@@ -120,7 +119,7 @@ _UM_PER_PA = 20.6
 def _kind_of_drift(um_per_s: float) -> Failure:
     if um_per_s >= 1.0:
         return Failure.STEP
-    return Failure.DRIFT if um_per_s >= 0.05 else Failure.HIDDEN
+    return Failure.DRIFT if um_per_s >= 0.05 else Failure.DRIFT_WITHIN_CLIMATE
 
 
 def _common(sensor: FilmSensor, unit: float, noise: float) -> Iterator[SensorFailure]:

@@ -8,7 +8,6 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
-from membrane_ctrl.controller.redundancy import FilmSensor
 from membrane_ctrl.controller.safety import MOVING, TABLE
 
 RULES = {rule.name: rule for rule in TABLE}
@@ -40,6 +39,6 @@ def test_a_failed_sensor_is_bounded_by_another_one(value: ProcessValue, failed: 
     if value is ProcessValue.OPTICS and failed is FilmSensor.LASER:
         return  # no laser is used
     bound = find_bound(value, failed, failure, Config())
-    assert bound.by is not failed
-    assert bound.by is not FilmSensor.LASER or value is not ProcessValue.OPTICS
+    assert bound.sensor is not failed
+    assert bound.sensor is not FilmSensor.LASER or value is not ProcessValue.OPTICS
     assert 0.0 < bound.distance_um < 2855.0  # where the pressure limit would end it

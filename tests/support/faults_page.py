@@ -8,7 +8,6 @@ from pathlib import Path
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
-from membrane_ctrl.controller.redundancy import FilmSensor
 from membrane_ctrl.controller.safety import (
     ALWAYS,
     CONNECTED,
@@ -127,7 +126,7 @@ def _protections() -> list[str]:
         for sensor in FilmSensor:
             if value is not ProcessValue.OPTICS or sensor is not FilmSensor.LASER:
                 cells = (find_bound(value, sensor, failure, Config()) for failure in Failure)
-                bounds = " | ".join(f"{bound.distance_um:.0f} um ({bound.by.value})" for bound in cells)
+                bounds = " | ".join(f"{bound.distance_um:.0f} um ({bound.sensor.value})" for bound in cells)
                 lines.append(f"| {value.value} | {sensor.value} | {bounds} |")
     return lines
 
