@@ -1,7 +1,7 @@
 """What protects the mirror in each process value and state in which the pump may run: a table for review and tests.
 
-The rules are in `safety.TABLE`. Whichever sensor the loop follows, for each `Duty` and `Activity` at least one rule or
-guard exists; tests check that. `docs/faults.md` shows the table, and the campaign measures the bounds
+The rules are in `safety.TABLE`. Whichever sensor the loop follows, for each `Duty` and `Activity` at least one rule
+or guard exists; tests check that. `docs/faults.md` shows the table, and the campaign measures the bounds
 (`docs/protection.md`).
 """
 

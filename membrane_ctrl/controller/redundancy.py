@@ -52,10 +52,9 @@ class RedundancyWatch:
         """
         events: list[Event] = []
         if not pump_may_run:
-            for sensor in sort_sensors(self._reported):
-                events.append(MaintenanceOver(name_notice(sensor), "the hold has ended"))
+            ended = sort_sensors(self._reported)
             self._forget()
-            return events
+            return [MaintenanceOver(name_notice(sensor), "the hold has ended") for sensor in ended]
         for sensor, is_present in present.items():
             if is_present:
                 self._last_present_s[sensor] = now_s

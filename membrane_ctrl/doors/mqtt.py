@@ -27,6 +27,7 @@ from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY, is_safety_command
 from membrane_ctrl.doors.command_lanes import MOVES_NOTHING, overtaken
 from membrane_ctrl.doors.mqtt_barrier import OrderBarrier
+from membrane_ctrl.doors.mqtt_client import CancellableClient
 from membrane_ctrl.doors.mqtt_inbox import HandleMessage, Inbox, Reports
 from membrane_ctrl.doors.mqtt_owner import NameOwnership, OwnerClaim
 from membrane_ctrl.doors.names import TABLE, Door, Published
@@ -119,7 +120,7 @@ class Broker:
         if self._version is aiomqtt.ProtocolVersion.V5:
             properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             properties.MaximumPacketSize = _PACKET_BYTES_MAX
-        return aiomqtt.Client(
+        return CancellableClient(
             self._config.host,
             self._config.port,
             username=self._config.username,

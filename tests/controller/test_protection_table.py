@@ -7,7 +7,16 @@ from itertools import product
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
+from membrane_ctrl.controller.protection import (
+    Activity,
+    Duty,
+    Failure,
+    FilmSensor,
+    Guard,
+    ProcessValue,
+    find_bound,
+    find_keepers,
+)
 from membrane_ctrl.controller.safety import MOVING, TABLE
 
 RULES = {rule.name: rule for rule in TABLE}

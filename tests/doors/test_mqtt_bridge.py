@@ -21,6 +21,8 @@ import pytest
 from membrane_ctrl.config.port import MqttConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.doors import mqtt, mqtt_owner
+from membrane_ctrl.doors.mqtt_client import CancellableClient
+from membrane_ctrl.doors.mqtt_inbox import Reports
 from membrane_ctrl.doors.mqtt_owner import OwnerClaim
 from membrane_ctrl.doors.names import Door
 from membrane_ctrl.model.errors import DeviceError
@@ -463,3 +465,24 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
     assert connections <= 4.0 / mqtt._AGAIN_S + 2
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 20_000
     assert len(capsys.readouterr().err.splitlines()) <= 3, "one line, not one for each attempt"
+
+
+async def test_a_cancellation_in_the_moment_of_a_confirmation_ends_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`asyncio.wait_for` of Python 3.11 returns the result, and the cancellation is lost."""
+    confirmed = asyncio.Event()
+
+    async def publish(self: object, *args: object, **kwargs: object) -> None:
+        await asyncio.wait_for(confirmed.wait(), 5.0)
+
+    monkeypatch.setattr(aiomqtt.Client, "publish", publish)
+    client = CancellableClient("127.0.0.1")
+    reports = Reports(client.publish, 0.0)
+    reports.add("done")
+    task = asyncio.create_task(reports.run())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    confirmed.set()
+    await asyncio.sleep(0)
+    task.cancel()
+    done, _ = await asyncio.wait({task}, timeout=1.0)
+    assert done

@@ -17,7 +17,6 @@ from patience import slow_machine
 from pymodbus.client import ModbusTcpClient
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.run_files.latched_fault import LatchedFile
 
 pytestmark = pytest.mark.real_time
 
@@ -105,4 +104,5 @@ def test_beside_a_hold_nothing_else_opens_its_board_and_safe_stops_it_for_good(b
     (fault,) = [event for event in bench.events() if event["kind"] == "fault"]
     assert fault["name"] in ("board_fault", "locked")
     assert not [event for event in bench.events() if event["kind"] == "resumed"]
-    assert LatchedFile(bench.folder / "logs").read() is not None
+    (lock,) = [event for event in bench.events() if event["kind"] == "lock"]
+    assert lock["text"]

@@ -7,7 +7,16 @@ from pathlib import Path
 
 from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.protection import Activity, Duty, Failure, Guard, ProcessValue, find_bound, find_keepers
+from membrane_ctrl.controller.protection import (
+    Activity,
+    Duty,
+    Failure,
+    FilmSensor,
+    Guard,
+    ProcessValue,
+    find_bound,
+    find_keepers,
+)
 from membrane_ctrl.controller.safety import (
     ALWAYS,
     CONNECTED,
