@@ -337,6 +337,16 @@ class PlausibilityCheck:
         self.liar = Liar.NOBODY
         self.changes = Changes(math.nan, math.nan, math.nan)
 
+    def rebase(self) -> None:
+        """Compare from the present means on: the sensor that was found wrong is used again in its new place."""
+        means = (self._laser.value, self._optics.value, self._gauge.value)
+        if not all(map(math.isfinite, means)):
+            self.reset()
+            return
+        self._fast.begin(means)
+        self._slow.begin(means)
+        self.liar, self._slow_wrong = Liar.NOBODY, False
+
     @property
     def watching(self) -> bool:
         """Whether it has had readings since the last `reset`."""

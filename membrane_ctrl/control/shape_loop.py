@@ -187,6 +187,10 @@ class ShapeLoop:
                 self._admit(estimate)
             if self._state == telemetry.ShapeState.TRACKING:
                 self._move_trim(now_s, dt_s)
+        return self.output(now_s)
+
+    def output(self, now_s: float) -> ShapeOutput:
+        """The output of the last tick, with the present age of its estimate."""
         return ShapeOutput(
             self._state,
             self._reason,

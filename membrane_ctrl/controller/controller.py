@@ -8,6 +8,8 @@ import math
 from collections.abc import Collection
 from dataclasses import asdict, replace
 
+from numpy.linalg import LinAlgError
+
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
@@ -94,10 +96,13 @@ class Controller:
         last = scene.output or inner_loop.NO_OUTPUT
         judged = self.state in safety.MOVING and not scene.paused  # nothing follows a setpoint in a pause
         error_um = last.error_um if judged else math.nan
-        scene.observer.look(inputs)
+        scene.observer.look(inputs, self._may_follow_optics())
         consistency = self._consistency
         events += consistency.ask(
-            inputs, self.state, scene.dt_s, sensor_consistency.hold_status(scene, last, self._holders.optics_hold)
+            inputs,
+            self.state,
+            scene.dt_s,
+            sensor_consistency.hold_status(scene, last, self._holders.optics_hold, self._may_follow_optics()),
         )
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
@@ -145,6 +150,12 @@ class Controller:
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
         )
+
+    def _may_follow_optics(self) -> bool:
+        """Whether the estimate uses the figures: what it leaves out must not replace a lost laser."""
+        if self._config.by_optics:
+            return True
+        return self._shape.on and not self._consistency.camera_lies and not self._holders.optics_left_out
 
     def _displacement_suffices(self) -> bool:
         """Whether the displacement is known as well as the present state needs it.
@@ -327,14 +338,14 @@ class Controller:
         settled = self.state == State.HOLD and scene.levels.safe_level == SafeLevel.NONE
         if self._consistency.laser_moved and self._shape.on:
             self._shape.lock(inputs.now_s)
-        shape = self._shape.step(
-            inputs.now_s,
-            scene.dt_s,
-            inputs.estimate,
-            scene.observer.displacement_um,
-            settled,
-            self._consistency.camera_lies or _WITHOUT_LASER * self._config.by_optics,
-        )
+        distrust = self._consistency.camera_lies or _WITHOUT_LASER * self._config.by_optics
+        try:
+            shape = self._shape.step(
+                inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled, distrust
+            )
+        except (ValueError, ArithmeticError, LinAlgError) as error:
+            self._tick_error = f"shape loop: {type(error).__name__}: {error}"
+            shape = self._shape.output(inputs.now_s)
         scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news
         if (shape.state, words) != self._shape_was:

@@ -70,8 +70,11 @@ class Observer:
         """Note the tick's command for comparison with the next read-backs."""
         self.commanded = (command.pump_fraction, self.commanded[0])
 
-    def look(self, inputs: tick.TickInputs) -> None:
-        """Take the tick's reading and find what is new or a jump."""
+    def look(self, inputs: tick.TickInputs, may_follow_optics: bool = True) -> None:
+        """Take the tick's reading and find what is new or a jump.
+
+        `may_follow_optics`: the estimate uses the figures; otherwise they replace no laser.
+        """
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
         if math.isnan(self._last_read_s):  # ages count from the first tick
@@ -89,7 +92,8 @@ class Observer:
         self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
         self.optics_replace_laser = False
-        if self._follows_optics and math.isnan(self.moving_laser_um):
+        replaceable = self._follows_optics and may_follow_optics
+        if replaceable and math.isnan(self.moving_laser_um):
             self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa

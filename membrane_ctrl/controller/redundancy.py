@@ -11,6 +11,7 @@ from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 LOST_S = 2.0
 # A notice ends once the sensor has stayed this long.
 BACK_S = 10.0
+_IS = {FilmSensor.LASER: "is", FilmSensor.OPTICS: "are", FilmSensor.GAUGE: "is"}
 
 
 class RedundancyWatch:
@@ -70,7 +71,8 @@ class RedundancyWatch:
             return []
         self._reported.add(sensor)
         left = [other for other in FilmSensor if present.get(other, False)]
-        message = f"the {sensor.value} is lost; {self._describe(left)}. Find out why before another sensor fails"
+        lost = f"the {sensor.value} {_IS[sensor]} lost"
+        message = f"{lost}; {self._describe(left)}. Find out why before another sensor fails"
         return [Maintenance(name_notice(sensor), message)]
 
     def _report_return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
@@ -81,7 +83,7 @@ class RedundancyWatch:
             return []
         self._reported.discard(sensor)
         del self._present_again_since_s[sensor]
-        return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} is back")]
+        return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} {_IS[sensor]} back")]
 
     def _describe(self, left: Collection[FilmSensor]) -> str:
         """What still bounds the true displacement, with the distances of the protection table."""

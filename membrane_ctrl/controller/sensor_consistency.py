@@ -1,6 +1,7 @@
 """The sensors of a held mirror: which one is wrong by the others and the film, what wears out, which ones hold it."""
 
 import math
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -40,10 +41,13 @@ class HoldStatus:
     bleed_fraction: float  # of the vent, held open on purpose
     optics_hold: bool = False  # they see the centre, and its estimate is held: a laser that moved is known
     sag_um: float = math.nan  # by the newest figure; NaN without a usable one
+    optics_usable: bool = True  # the estimate, or the shape loop, uses the figures
     figure: ShapeEstimate | None = None  # that arrived in this tick and may be used
 
 
-def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) -> HoldStatus:
+def hold_status(
+    scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
+) -> HoldStatus:
     """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick before."""
     return HoldStatus(
         laser_um=scene.observer.moving_laser_um,
@@ -57,6 +61,7 @@ def hold_status(scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool) ->
         optics_hold=optics_hold,
         sag_um=scene.observer.figures.sag_um,
         figure=scene.observer.figures.accepted,
+        optics_usable=optics_usable,
     )
 
 
@@ -69,6 +74,31 @@ def _find_figure_lag_s(config: Config) -> float:
     shape = config.shape
     interval_s = 1 / shape.track_rate_hz if shape.mode == "track" else shape.period_s
     return interval_s + _FIGURE_TAKES_S
+
+
+# An answer of the laser counts as much as so many ticks without one.
+_ANSWER_COUNTS = 4.0
+# So that a laser that is back is used after a second.
+_MISSING_MAX_S = 4.0
+# Within this time a knock or two are possible; a sensor that jumps more often is unsteady.
+_UNSTEADY_S = 600.0
+_VERDICTS_MAX, _OPTICS_JUMPS_MAX = 2, 5
+
+
+class RecentCount:
+    """Counts events of the last ten minutes."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._times_s: deque[float] = deque(maxlen=most + 1)
+
+    def add(self, now_s: float) -> None:
+        """Count one."""
+        self._times_s.append(now_s)
+
+    def too_many(self, now_s: float) -> bool:
+        """Whether there were more than allowed."""
+        return len(self._times_s) > self._most and now_s - self._times_s[0] <= _UNSTEADY_S
 
 
 class SensorConsistency:
@@ -107,6 +137,7 @@ class SensorConsistency:
         self._setpoint_um, self._bleed_fraction = config.loop.setpoint_um, config.loop.bleed_fraction
         self._liar = film.Liar.NOBODY
         self._lies_s, self.laser_moved = 0.0, False
+        self._laser_verdicts = RecentCount(_VERDICTS_MAX)
         self._weather_s = 0.0
         self._weather_told = False
         self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
@@ -120,7 +151,9 @@ class SensorConsistency:
         if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
             self._bleed_fraction = held.bleed_fraction
             self._growth.reset()
-        self._laser_missing_s = 0.0 if math.isfinite(laser_um) else self._laser_missing_s + dt_s
+        # A laser that answers now and then counts as missing; one that misses a reading now and then does not.
+        change_s = -_ANSWER_COUNTS * dt_s if math.isfinite(laser_um) else dt_s
+        self._laser_missing_s = min(max(self._laser_missing_s + change_s, 0.0), _MISSING_MAX_S)
         self._compare_with_gauge(state, dt_s, held)
         events = self._doubt_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
@@ -135,10 +168,13 @@ class SensorConsistency:
         blind = not inputs.now_s - self._camera_s <= self._fresh_s
         liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self._lies_s = self._lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
-        self.laser_moved = self._lies_s > film.WARM_S  # a knock is over: the estimate knows the laser's new place
+        # A knock is over: the estimate knows the laser's new place. A laser that is knocked again and again is not.
+        self.laser_moved = self._lies_s > film.WARM_S and not self._laser_verdicts.too_many(inputs.now_s)
         if self.laser_moved:
-            self._plausibility.reset()
+            self._plausibility.rebase()
             liar = film.Liar.NOBODY
+        if liar == film.Liar.LASER and self._liar != film.Liar.LASER:
+            self._laser_verdicts.add(inputs.now_s)
         events += self._judge(liar)
         if moves or state == State.SETTLE:
             return events
@@ -229,7 +265,7 @@ class SensorConsistency:
         """Report a lost sensor of the film while the pump is driven."""
         present = {
             FilmSensor.LASER: math.isfinite(held.laser_um),
-            FilmSensor.OPTICS: held.optics_hold or math.isfinite(held.sag_um),
+            FilmSensor.OPTICS: held.optics_hold or (held.optics_usable and math.isfinite(held.sag_um)),
             FilmSensor.GAUGE: math.isfinite(held.gauge_pressure_pa),
         }
         return self._redundancy.step(now_s, state in safety.MOVING, present)
@@ -300,6 +336,10 @@ _STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be th
 _STANDS_S = 1.5  # a sensor that comes and goes within this, as a slower camera does at first, is not reported
 
 
+_UNSTEADY_MESSAGE = (
+    "the optics have jumped against the laser again and again; they are left out, and the mirror follows the laser. "
+    "Look for vibration, reflections or a loose camera, then `ctl shape off` and `on` use them again"
+)
 _JUMP_TAKES_S = 2.0  # until the estimate has followed a jump of the laser
 
 
@@ -318,18 +358,26 @@ class MountDrift:
         """Count from a place of the mount, in um."""
         self._last_um = mount_um
         self._drift_um = 0.0
+        self._optics_jumps = RecentCount(_OPTICS_JUMPS_MAX)
         self._jump_left_s = 0.0
         self.beyond_limit = False
 
-    def step(self, mount_um: float, laser_jumped: bool, dt_s: float) -> list[Event]:
+    def step(self, mount_um: float, jumped: Collection[Sensor], now_s: float, dt_s: float) -> list[Event]:
         """Follow the mount; returns the notice once the limit is passed, which only `start` takes back.
 
-        `laser_jumped`: the estimate has found in this tick that the laser has jumped.
+        `jumped`: the sensors of which the estimate has found a jump in this tick. Optics that jump again and again
+        lead the estimate away in steps that each look like a knock; they are left out as well.
         """
         moved_um = mount_um - self._last_um
         self._last_um = mount_um
         if self.beyond_limit:
             return []
+        if Sensor.OPTICS in jumped:
+            self._optics_jumps.add(now_s)
+            if self._optics_jumps.too_many(now_s):
+                self.beyond_limit = True
+                return [Maintenance("optics_unsteady", _UNSTEADY_MESSAGE)]
+        laser_jumped = Sensor.LASER in jumped
         self._jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, self._jump_left_s - dt_s)
         if self._jump_left_s == 0.0:
             self._drift_um += moved_um
@@ -367,6 +415,11 @@ class Holders:
     def optics_hold(self) -> bool:
         """Whether the mirror is held without a laser: the optics see it."""
         return self.estimate is not None and self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+
+    @property
+    def optics_left_out(self) -> bool:
+        """Whether figures are not used until a person accepts the optics again."""
+        return self._mount_drift.beyond_limit
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take the feed-forward's gains from other settings."""
@@ -422,8 +475,8 @@ class Holders:
         self.estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = self.estimate.mount_um
         news = [*self._news(inputs.now_s, self.estimate.jumped), *self._told_of_stand()]
-        laser_jumped = Sensor.LASER in self.estimate.jumped_sensors
-        news += self._mount_drift.step(self.estimate.mount_um, laser_jumped, scene.dt_s)
+        jumped = self.estimate.jumped_sensors
+        news += self._mount_drift.step(self.estimate.mount_um, jumped, inputs.now_s, scene.dt_s)
         if self._sees(Sensor.OPTICS):
             sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
             self.estimate = replace(self.estimate, sigma_um=sigma_um)

@@ -359,3 +359,82 @@ def test_sound_sensors_contradict_each_other_nowhere(
     assert held.told(Plausibility) == []
     assert held.faults == []
     assert held.notices == []
+
+
+def alternating(um: float, period_s: float) -> Spoil:
+    def spoil(since_s: float, figure: ShapeEstimate) -> ShapeEstimate:
+        return replace(figure, sag_um=figure.sag_um + um * (since_s % period_s < period_s / 2))
+
+    return spoil
+
+
+def outlying(um: float, one_in: int) -> Spoil:
+    rng = np.random.default_rng(1)
+
+    def spoil(since_s: float, figure: ShapeEstimate) -> ShapeEstimate:
+        return replace(figure, sag_um=figure.sag_um + um * (rng.random() < 1 / one_in))
+
+    return spoil
+
+
+@pytest.mark.parametrize("spoil", [alternating(10.0, 2.0), outlying(15.0, 6)], ids=["alternating", "1 in 6"])
+def test_optics_that_jump_again_and_again_are_left_out(spoil: Spoil) -> None:
+    """Each step looks like a knock of the laser; together they led the mirror by hundreds of micrometres."""
+    held = Bench(config_of("estimate"), spoil).fail(150.0)
+    assert "optics_unsteady" in held.notices
+    assert held.moved_um < 30.0
+    assert held.faults == []
+
+
+def test_a_laser_that_is_knocked_again_and_again_does_not_lead_the_film() -> None:
+    def knock(wrong: Wrong, since_s: float) -> None:
+        wrong.laser_offset_um = 45.0 if since_s % 20.0 < 10.0 else 0.0
+
+    held = Bench(config_of("estimate")).fail(300.0, knock)
+    assert held.moved_um < 20.0
+    assert "laser" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+
+
+def leak_more(wrong: Wrong, since_s: float) -> None:
+    wrong.no_light = True
+    wrong.vent_stuck_fraction = 0.004
+
+
+def test_optics_that_the_estimate_does_not_use_replace_no_laser() -> None:
+    """With the shape loop off the loop would follow a dead reckoning, and only the optics would be judged."""
+    held = Bench(config_of("estimate"))
+    held.command(Command("shape_off", "a test"))
+    held.fail(60.0, leak_more)
+    assert held.faults[0] == "displacement_missing"
+    assert held.state == State.FAULT
+    assert held.moved_um < 30.0
+
+
+def test_optics_that_were_outvoted_replace_no_laser() -> None:
+    def fail(wrong: Wrong, since_s: float) -> None:
+        if since_s > 60.0:
+            leak_more(wrong, since_s)
+
+    held = Bench(config_of("estimate"), stepping(18.0)).fail(120.0, fail)
+    assert held.faults[0] == "displacement_missing"
+    assert held.moved_um < 30.0
+
+
+def test_a_laser_that_answers_now_and_then_counts_as_missing() -> None:
+    ticks = 0
+
+    def seldom(wrong: Wrong, since_s: float) -> None:
+        nonlocal ticks
+        ticks += 1
+        wrong.no_light = ticks % 19 != 0
+
+    held = Bench(config_of("estimate"), drifting(-5.0)).fail(70.0, seldom)
+    assert held.moved_um < 100.0
+    assert held.state == State.FAULT
+
+
+def test_a_figure_that_the_shape_loop_cannot_use_is_a_fault_and_no_exception() -> None:
+    held = Bench(config_of("estimate"), lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5])).fail(
+        5.0
+    )
+    assert held.faults == ["tick_error"]
