@@ -10,9 +10,11 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import random
 import sys
+import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, as_completed, wait
 from dataclasses import asdict, dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -31,7 +33,7 @@ PHASES = (0.0, 2.0, 4.0)  # of humidity against temperature
 # How long a cell is followed: beyond the ten minutes of a pause or of manual flow; beyond an experiment of a minute;
 # for drifts that take hours in a hold; otherwise for minutes.
 PAUSE_S, TUNE_S, DRIFT_S, HOLD_S = 660.0, 120.0, 45_000.0, 330.0
-_PAIR_SEED = 7
+_PAIR_SEED, _ORDER_SEED = 7, 3
 
 
 @dataclass(frozen=True)
@@ -115,28 +117,45 @@ def load_done() -> dict[Cell, Outcome]:
     return done
 
 
-def run_all(cells: Iterable[Cell], processes: int) -> dict[Cell, Outcome]:
-    """Run what is not done yet, short cells first, and store each result."""
+def order_cells(cells: Iterable[Cell]) -> list[Cell]:
+    """Cells in a seeded random order, so that a part of them is a fair sample."""
+    ordered = list(cells)
+    random.Random(_ORDER_SEED).shuffle(ordered)
+    return ordered
+
+
+def run_all(cells: Iterable[Cell], processes: int, minutes: float) -> dict[Cell, Outcome]:
+    """Run what is not done yet, for so long; store each result, and return those that are done."""
     done = load_done()
     wanted = list(cells)
-    todo = sorted((cell for cell in wanted if cell not in done), key=lambda cell: cell.lasts_s)
+    todo = (cell for cell in wanted if cell not in done)
+    until_s = time.monotonic() + 60.0 * minutes
     RESULTS.parent.mkdir(exist_ok=True)
     with (
         RESULTS.open("a", encoding="utf-8") as file,
         ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
     ):
-        futures = {pool.submit(run, cell): cell for cell in todo}
-        for number, future in enumerate(as_completed(futures), 1):
-            cell, outcome = futures[future], future.result()
-            done[cell] = outcome
-            finite = {
-                key: None if isinstance(x, float) and math.isnan(x) else x for key, x in asdict(outcome).items()
-            }
-            file.write(json.dumps({"cell": asdict(cell), "outcome": finite}) + "\n")
-            file.flush()
-            if number % 50 == 0:
-                print(f"{number} of {len(todo)}", file=sys.stderr)
-    return {cell: done[cell] for cell in wanted}
+        running: dict[Future[Outcome], Cell] = {}
+        while True:
+            while len(running) < 2 * processes and time.monotonic() < until_s:
+                cell = next(todo, None)
+                if cell is None:
+                    break
+                running[pool.submit(run, cell)] = cell
+            if not running:
+                break
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                cell = running.pop(future)
+                done[cell] = future.result()
+                file.write(json.dumps(_to_json(cell, done[cell])) + "\n")
+                file.flush()
+    return {cell: done[cell] for cell in wanted if cell in done}
+
+
+def _to_json(cell: Cell, outcome: Outcome) -> dict[str, object]:
+    finite = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in asdict(outcome).items()}
+    return {"cell": asdict(cell), "outcome": finite}
 
 
 def run_weeks(days: float, processes: int) -> dict[str, Week]:
@@ -154,7 +173,7 @@ def run_weeks(days: float, processes: int) -> dict[str, Week]:
         for future in as_completed(futures):
             weeks[futures[future].value] = future.result()
             WEEKS.write_text(json.dumps({v: asdict(week) for v, week in weeks.items()}), encoding="utf-8")
-    return {value.value: weeks[value.value] for value in ProcessValue}
+    return {value.value: weeks[value.value] for value in ProcessValue if value.value in weeks}
 
 
 def main() -> int:
@@ -165,6 +184,7 @@ def main() -> int:
     parser.add_argument("--in", dest="within", default="", help="only undertakings whose names contain this")
     parser.add_argument("--fresh", action="store_true", help="forget what is done")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no cell after so long")
     parser.add_argument(
         "--days", type=float, default=7.0, help="of climate without a failure, for each process value"
     )
@@ -178,9 +198,10 @@ def main() -> int:
             if chosen and arguments.only in " and ".join(cell.failures):
                 print(cell, run(cell), flush=True)
         return 0
-    results = run_all([*list_singles(), *list_pairs()], arguments.processes)
-    weeks = run_weeks(arguments.days, arguments.processes)
-    beyond = write_page(results, weeks)
+    cells = [*list_singles(), *list_pairs()]
+    results = run_all(order_cells(cells), arguments.processes, arguments.minutes)
+    weeks = run_weeks(arguments.days, arguments.processes) if arguments.days > 0 else {}
+    beyond = write_page(results, weeks, cells)
     faults = sum(len(week.faults) for week in weeks.values())
     print(f"{len(results)} runs, {beyond} beyond their bound; {len(weeks)} weeks, {faults} false faults")
     return int(beyond > 0 or faults > 0)

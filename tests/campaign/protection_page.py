@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,16 +36,17 @@ themselves, by up to `states.manual_range_um` (50 um) and some um.
 """
 
 
-def write_page(results: Results, weeks: Mapping[str, Week]) -> int:
-    """Write the page; returns how many single failures went beyond their bound."""
+def write_page(results: Results, weeks: Mapping[str, Week], cells: Collection[Cell]) -> int:
+    """Write the page from the results of some or all cells; returns how many went beyond their bound."""
     singles = {cell: outcome for cell, outcome in results.items() if len(cell.failures) == 1}
     pairs = {cell: outcome for cell, outcome in results.items() if len(cell.failures) == 2}
     beyond = {cell: outcome for cell, outcome in singles.items() if abs(outcome.off_um) > _bound_um(cell)}
-    lines = [
-        _HEAD,
-        f"**{len(singles)} runs with one failure, {len(beyond)} beyond the stated bound; {len(pairs)} pairs.**",
-    ]
-    lines += ["", *_bounds(singles), *_activities(singles), *_slow_drifts(singles)]
+    share = ""
+    if len(results) < len(cells):
+        share = f"{len(results)} of {len(cells)} cells were run, in a seeded random order. "
+    counts = f"**{len(singles)} with one failure, {len(beyond)} beyond the stated bound; {len(pairs)} pairs.**"
+    lines = [_HEAD, share + counts, ""]
+    lines += [*_bounds(singles), *_activities(singles), *_slow_drifts(singles)]
     if beyond:
         lines += ["", "## Beyond the bound", "", *map(_line, beyond.items())]
     lines += [*_pairs(pairs), *_weeks(weeks)]
@@ -151,6 +152,8 @@ def _pairs(pairs: Results) -> list[str]:
 
 def _weeks(weeks: Mapping[str, Week]) -> list[str]:
     """Weeks without a failure."""
+    if not weeks:
+        return []
     lines = ["", "## Weeks without a failure", ""]
     lines += [
         "A room of +-2 K and +-10 % relative humidity a day (+235 um of the centre per 10 % at constant",
