@@ -87,13 +87,15 @@ server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Endless)
 threading.Thread(target=server.serve_forever, daemon=True).start()
 with limited_memory():
     print(send_to_all([Service(Reads())], "t", "b", "warning"), send_to_all([Service(Good())], "t", "b", "warning"))
-import resource
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+# ru_maxrss would be that of the process which started this one, if that was larger
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(int(peak.split()[1]) // 1024)
 """
 
 
 def test_an_answer_without_end_is_given_up_at_the_limit_of_memory() -> None:
-    done = subprocess.run([sys.executable, "-c", _ENDLESS], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", _ENDLESS], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
     outcome, memory_mb = done.stdout.splitlines()
     assert outcome == "False True"
     assert int(memory_mb) < 1000
