@@ -178,8 +178,10 @@ class Bound:
 # The pump moves the film by 5.3 um/s at most: means over ten seconds find that after 53 um, and some um more are gone
 # until the pump is off.
 _FAST_MOTION_UM = 65.0
-# The hour's limit is passed by a drift that comes on top of the law's uncertainty, and is judged by a lagging mean.
-_DRIFT_FACTOR = 2.0
+# The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30 % of its pressure
+# is linear in the sag, the gauge shows 80 %. A drift of 0.05 um/s then passes the limit by little and late: the
+# protection campaign measured 313 um after 1.7 h.
+_DRIFT_FACTOR = 3.0
 # As much further goes a drift while the day's reference follows it.
 _DAY_FACTOR = 1.3
 # Until the estimate no longer follows the optics.
