@@ -152,7 +152,7 @@ class GpioLines:
 
 
 def _settle(answer: asyncio.Future[Any], result: Any, failure: Exception | None) -> None:
-    """Give the thread's result to whoever still waits for it."""
+    """Give the thread's result to the caller, if it still waits."""
     if answer.done():
         return
     if failure is None:

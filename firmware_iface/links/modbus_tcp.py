@@ -49,7 +49,7 @@ class ModbusLink(Protocol):
         """Whether the connection is up."""
 
     async def connect(self) -> None:
-        """Connect anew."""
+        """Connect again."""
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Function code 3."""
@@ -79,7 +79,7 @@ class ModbusBitLink(Protocol):
         """Whether the connection is up."""
 
     async def connect(self) -> None:
-        """Connect anew."""
+        """Connect again."""
 
     async def read_coils(self, address: int, count: int) -> list[bool]:
         """Function code 1."""
@@ -152,7 +152,7 @@ class GuardedModbusTcp:
         return self._back_off.remaining_s(self._clock())
 
     async def connect(self) -> None:
-        """Connect anew. Raises LinkDownError (no connection, or not yet time for the next attempt)."""
+        """Connect again. Raises LinkDownError (no connection, or not yet time for the next attempt)."""
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()

@@ -4,15 +4,12 @@ A pump and a gauge on one register would feed the pump's command back as a press
 open together. Devices may be shared, places in them may not.
 """
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 from firmware_iface import settings
-
-if TYPE_CHECKING:
-    from membrane_ctrl.config.schema import DevicesConfig
 
 _WORDS = {"u32": 2, "i32": 2, "f32": 2}  # registers of a type; the others have one
 _MODBUS_PORT = 502
@@ -35,23 +32,30 @@ class DevicePlace:
     words: str
 
 
-def find_shared(devices: "DevicesConfig", name_link: Callable[[str], Hashable] | None = None) -> str:
+def find_shared(
+    roles: Mapping[str, object],
+    interlocks: Sequence[settings.InterlockDriver],
+    name_link: Callable[[str], Hashable] | None = None,
+) -> str:
     """One line on two roles that use the same place; empty if there are none.
 
-    `name_link` gives one and the same value for links that lead to one device, however spelt; without it only the
-    text of a link is compared, as far as it can be without asking the machine.
+    `roles` has the settings of each role's device. `name_link` gives one and the same value for links that lead to one
+    device, however spelt; without it only the text of a link is compared, as far as it can be without asking the
+    machine.
     """
     seen: dict[Hashable, DevicePlace] = {}
-    for place in list_places(devices, name_link or plain_link):
+    for place in list_places(roles, interlocks, name_link or plain_link):
         other = seen.setdefault(place.where, place)
         if other.key != place.key:
             return f"{other.key} and {place.key} name the same {place.words}; give each a place of its own"
     return ""
 
 
-def list_places(devices: "DevicesConfig", name_link: Callable[[str], Hashable]) -> Iterator[DevicePlace]:
+def list_places(
+    roles: Mapping[str, object], interlocks: Sequence[settings.InterlockDriver], name_link: Callable[[str], Hashable]
+) -> Iterator[DevicePlace]:
     """Yield every place that the roles and interlocks use, in the order of the configuration."""
-    for role, section in devices.roles().items():
+    for role, section in roles.items():
         key = f"devices.{role}"
         match section:
             case settings.ModbusMapConfig():
@@ -62,7 +66,7 @@ def list_places(devices: "DevicesConfig", name_link: Callable[[str], Hashable]) 
                 yield DevicePlace(f"{key}.unit_id", (device, "instrument"), f"instrument, {unit}")
                 for address in _BRONKHORST_REGISTERS:
                     yield DevicePlace(f"{key}.unit_id", (device, "holding", address), f"register {address} of {unit}")
-    for index, interlock in enumerate(devices.interlocks):
+    for index, interlock in enumerate(interlocks):
         yield circuit_place(f"devices.interlocks.{index}", interlock, name_link)
 
 

@@ -256,8 +256,10 @@ class Config(Section):
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
                 f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
             )
-        if self.devices is not None and (shared := device_places.find_shared(self.devices)):
-            raise ValueError(shared)
+        if self.devices is not None:
+            shared = device_places.find_shared(self.devices.roles(), self.devices.interlocks)
+            if shared:
+                raise ValueError(shared)
         if self.devices is not None and not (self.devices.board or self.devices.displacement or self.by_optics):
             raise ValueError(
                 'devices: no device for displacement; without a laser set estimator.process_value = "optics"'

@@ -151,7 +151,7 @@ def board_inputs(devices: DevicesConfig) -> dict[int, int]:
 
 def require_places(devices: DevicesConfig) -> None:
     """Refuse two roles on one place, also if their links are spelt differently. Raises InputError."""
-    shared = device_places.find_shared(devices, _device_of_link)
+    shared = device_places.find_shared(devices.roles(), devices.interlocks, _device_of_link)
     if shared:
         raise InputError(shared)
     ports: dict[str, tuple[str, str]] = {}
