@@ -39,8 +39,8 @@ def find_shared(
 ) -> str:
     """One line on two roles that use the same place; empty if there are none.
 
-    `roles` has the settings of each role's device. `name_link` gives one and the same value for links that lead to one
-    device, however spelt; without it only the text of a link is compared, as far as it can be without asking the
+    `roles` has the settings of each role's device. `name_link` gives one and the same value for links that lead to
+    one device, however spelt; without it only the text of a link is compared, as far as it can be without asking the
     machine.
     """
     seen: dict[Hashable, DevicePlace] = {}
