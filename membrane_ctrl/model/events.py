@@ -5,6 +5,7 @@ Python keyword). Keys with None as default are omitted if None.
 """
 
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields
 from typing import Any, ClassVar, dataclass_transform
 
@@ -37,6 +38,25 @@ class Event:
         """The line, without its times."""
         told = ((key, getattr(self, field.name), field.default is MISSING) for field, key in self.keys)
         return {"kind": self.kind} | {key: value for key, value, always in told if always or value is not None}
+
+    def numbers(self) -> tuple[float, ...]:
+        """Numbers and codes of the event, in the order of its fields; texts and missing values are left out.
+
+        Together with `kind` they identify what happened, independently of the wording: the checksum of a tick covers
+        them. A table counts with its numbers, in the order of its keys.
+        """
+        return tuple(number for field, _ in self.keys for number in _numbers_in(getattr(self, field.name)))
+
+
+def _numbers_in(value: object) -> Iterator[float]:
+    if isinstance(value, bool | int | float):
+        yield float(value)
+    elif isinstance(value, Mapping):
+        for key in sorted(value):
+            yield from _numbers_in(value[key])
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers_in(item)
 
 
 class StateEntered(Event, kind="state"):

@@ -88,3 +88,16 @@ def test_a_link_of_a_run_that_has_only_words_for_it(line: dict[str, Any], up: bo
     event = from_dict({"kind": "link", **line})
     assert isinstance(event, Link)
     assert event.up == up
+
+
+def test_the_numbers_of_an_event_do_not_depend_on_its_words() -> None:
+    fault = Fault(21, "over", "deep", "501 um", "limit", "vent", True, "look")
+    assert fault.numbers() == (21.0, 1.0)
+    assert Fault(21, "x", "y", "z", "", "", True, "").numbers() == fault.numbers()
+    assert StateEntered("hold", "settle", "inside").numbers() == ()
+
+
+def test_the_numbers_of_a_table_come_in_the_order_of_its_keys() -> None:
+    one = CommandTaken("gains", "ann", "", 60.0, loop={"ti_s": 2.0, "pump": {"scale": [1, 2]}, "name": "x"})
+    other = CommandTaken("gains", "bob", "", 60.0, loop={"pump": {"scale": (1, 2)}, "name": "y", "ti_s": 2.0})
+    assert one.numbers() == other.numbers() == (60.0, 1.0, 2.0, 2.0)
