@@ -1,14 +1,14 @@
 """One row of telemetry per tick, the names of its codes, and the state of the run that follows from rows and events.
 
-A row crosses to the other processes as plain doubles, so that writing it costs the tick a few microseconds. Codes
-(state, shape state, fault, safe level) are small integers; the order of the names gives them. The status serves all
-displays and notices.
+`columns` has the table of a row's columns. A row crosses to the other processes as plain doubles, so that writing it
+costs the tick a few microseconds. Codes (state, shape state, fault, safe level) are small integers; the order of the
+names gives them. The status serves all displays and notices.
 """
 
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from operator import attrgetter
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model.columns import COLUMNS, ColumnValues
 from membrane_ctrl.model.lock import Lock
 
 
@@ -54,53 +55,8 @@ class SafeLevel(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class TelemetryRow:
-    """What one tick read, decided and wrote; NaN for missing values."""
-
-    mono_s: float  # the run's clock at the start of the tick
-    tick: float
-    dt_s: float
-    lateness_ms: float
-    missed_ticks: float  # running count
-    state: float
-    shape_state: float
-    safe_level: float
-    fault: float  # 0: none
-    target_um: float  # end of the setpoint ramp
-    setpoint_um: float  # setpoint given to the loop, including the trim
-    displacement_um: float
-    filtered_um: float
-    error_um: float
-    p_um_per_s: float
-    i_um_per_s: float
-    d_um_per_s: float
-    feedforward_um_per_s: float
-    flow_wanted_um_per_s: float  # before the limits
-    flow_um_per_s: float  # after them
-    pump_fraction: float
-    vent_fraction: float
-    pump_readback_fraction: float
-    vent_readback_fraction: float
-    gauge_pressure_pa: float
-    ambient_pressure_pa: float
-    air_temperature_c: float
-    gas_temperature_c: float
-    displacement_quality: float
-    sample_counter: float
-    device_time_s: float
-    leak_um_per_s: float
-    trim_um: float
-    truth_displacement_um: float  # twin only: the centre's true displacement
-    truth_laser_bias_um: float  # twin only
-    # the estimate of the centre (docs/estimator.md), which `filtered_um` then is; NaN if the laser is held
-    estimate_sigma_um: float = math.nan
-    optics_share: float = math.nan  # of the corrections of the estimate; the laser has the rest
-    laser_innovation: float = math.nan  # reading less expectation, in standard deviations; NaN while it is not used
-    optics_innovation: float = math.nan
-    barometer_innovation: float = math.nan
-    thermometer_innovation: float = math.nan
-    # bit i: interlock i of the configuration is open or its signal lost; NaN without interlocks, or without a reading
-    interlocks_open: float = math.nan
+class TelemetryRow(ColumnValues):
+    """What one tick read, decided and wrote: its columns, and its bytes."""
 
     def pack(self) -> bytes:
         """The row as doubles in field order."""
@@ -114,7 +70,7 @@ class TelemetryRow:
 
 # By its name in tables, events, checksums and memories of earlier versions: a field.
 TODAY: dict[str, str] = {"rung": "safe_level"}
-FIELDS: tuple[str, ...] = tuple(field.name for field in fields(TelemetryRow))
+FIELDS: tuple[str, ...] = tuple(COLUMNS)
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size

@@ -11,6 +11,7 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.ctl import lock_lines
+from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
 from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history, marks
@@ -31,13 +32,6 @@ _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
 _LONG_CHART_LIFE_S = 30.0
-_FIGURES = (
-    ("error", "error_um", "um", 2), ("setpoint", "setpoint_um", "um", 2), ("laser", "displacement_um", "um", 2),
-    ("pump", "pump_fraction", "", 3), ("leak", "leak_um_per_s", "um/s", 3), ("trim", "trim_um", "um", 2),
-    ("gauge pressure", "gauge_pressure_pa", "Pa", 1), ("ambient", "ambient_pressure_pa", "Pa", 0),
-    ("air", "air_temperature_c", "°C", 2), ("gas", "gas_temperature_c", "°C", 2), ("late", "lateness_ms", "ms", 1),
-    ("missed ticks", "missed_ticks", "", 0),
-)  # fmt: skip
 _CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"  # a phone is narrow
 _PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
 _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
@@ -152,10 +146,10 @@ class WebPage:
     def _build_numbers(self) -> dict[str, ui.label]:
         found = {}
         with ui.grid().classes("w-full gap-2").style("grid-template-columns: repeat(auto-fill, minmax(8.5rem, 1fr))"):
-            for name, field, unit, _ in _FIGURES:
+            for column in PUBLISHED:
                 with ui.card().classes("q-pa-sm gap-0"):
-                    ui.label(f"{name}{f', {unit}' if unit else ''}").classes("text-caption")
-                    found[field] = ui.label("-").classes("text-h6").props(f'data-field="{field}"')
+                    ui.label(column.title).classes("text-caption")
+                    found[column.name] = ui.label("-").classes("text-h6").props(f'data-field="{column.name}"')
         return found
 
     def _build_chart(self) -> None:
@@ -235,9 +229,9 @@ class WebPage:
             self._state.props(f"color={colour} text-color={'white' if colour == 'negative' else 'black'}")
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._alarm.set_text(alarms_of(status))
-        for _, field, _, digits in _FIGURES:
-            value = row.get(field)
-            self._numbers[field].set_text("-" if value is None or silent else f"{value:z.{digits}f}")
+        for column in PUBLISHED:
+            value = None if silent else row.get(column.name)
+            self._numbers[column.name].set_text(column.format_value(value))
         for button, action in self._buttons:
             allowed = not silent and may(self._user, seen.role, action) and state in action.states
             if button.enabled != allowed:

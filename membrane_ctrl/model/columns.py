@@ -1,0 +1,454 @@
+"""The table of telemetry columns: the one place for their names, units, labels, decimals, plots and descriptions.
+
+Each field of `ColumnValues` is a column, and its `column(...)` is the column's row of the table. To add a column, add
+a field here, and its value where the controller makes the row (`controller/scene.py`). The recording, the run's
+tables, the viewer's plots, page, console, `ctl status`, bridges, report, Grafana dashboard and docs/telemetry.md are
+made from this table.
+
+An identifier ends in its unit (`error_um`), people read the unit as usual (µm): `unit_of` gives one for the other.
+"""
+
+import math
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from typing import Any
+
+from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
+
+# By the end of an identifier: the unit for people. The first one that fits counts.
+UNIT_SUFFIXES: dict[str, str] = {
+    "_um_per_s": "µm/s",
+    "_um": "µm",
+    "_pa": "Pa",
+    "_c": "°C",
+    "_ms": "ms",
+    "_s": "s",
+    "_innovation": "σ",
+}
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of an identifier for people.
+
+    Parameters
+    ----------
+    name : str
+        With its unit as suffix, such as `error_um`.
+
+    Returns
+    -------
+    str
+        Such as `µm`; empty for counts, codes and fractions.
+    """
+    return next((unit for suffix, unit in UNIT_SUFFIXES.items() if name.endswith(suffix)), "")
+
+
+class Kind(Enum):
+    """What the numbers of a column are."""
+
+    QUANTITY = "quantity"
+    COUNT = "count"  # an integer
+    CODE = "code"  # an integer that stands for a name
+
+
+class Aggregation(Enum):
+    """What the overview levels (1, 10 and 60 s) keep of a column."""
+
+    NONE = "none"
+    EXTREMES = "min, mean, max"
+    LAST = "last"
+    LARGEST = "largest"
+
+
+class Group(Enum):
+    """Groups of columns: a section of displays and documentation."""
+
+    LOOP = "Loop"
+    PUMP = "Pump"
+    ESTIMATE = "Estimate of the centre"
+    ENVIRONMENT = "Gas and air"
+    SHAPE = "Shape"
+    TIMING = "Timing"
+    STATE = "State"
+    RECORD = "Record"  # for programs rather than people: in no plot
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A plot of the viewer and the report.
+
+    Attributes
+    ----------
+    title : str
+        Without the unit, which is that of its columns.
+    group : Group
+        Of the columns that the plot shows.
+    means : bool
+        Whether the viewer also shows the mean of each second over the whole run.
+    """
+
+    title: str
+    group: Group
+    means: bool = False
+
+
+POSITION = Plot("Position of the centre", Group.LOOP, means=True)
+ERROR = Plot("Error", Group.LOOP)
+TERMS = Plot("P, I, D and feed-forward", Group.LOOP)
+FLOW = Plot("Flow and leak", Group.PUMP, means=True)
+DRIVE = Plot("Pump and vent", Group.PUMP, means=True)
+ESTIMATE_SIGMA = Plot("Estimate of the centre, 1 σ", Group.ESTIMATE)
+INNOVATIONS = Plot("Innovations in standard deviations", Group.ESTIMATE)
+OPTICS_SHARE = Plot("Share of the optics in the estimate", Group.ESTIMATE)
+GAUGE = Plot("Gauge pressure", Group.ENVIRONMENT, means=True)
+AMBIENT = Plot("Ambient pressure", Group.ENVIRONMENT, means=True)
+TEMPERATURES = Plot("Temperatures", Group.ENVIRONMENT, means=True)
+TRIM = Plot("Trim of the shape loop", Group.SHAPE)
+LATENESS = Plot("Lateness of the tick", Group.TIMING)
+INTERVAL = Plot("Time between ticks", Group.TIMING)
+MISSED = Plot("Ticks missed so far", Group.TIMING)
+CODES = Plot("Codes", Group.STATE)
+RECORD = Plot("Record", Group.RECORD)
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of telemetry.
+
+    Attributes
+    ----------
+    name : str
+        Identifier with its unit as suffix: field of the row, column of tables, topic of bridges.
+    label : str
+        For people, without the unit.
+    description : str
+        What it is, as a phrase.
+    plot : Plot
+        Where it is drawn, which also says to which group it belongs.
+    entity : str
+        Rerun entity. Columns that are known together share one: m scalars of one entity cost the writer and the
+        viewer far less than m entities. Empty: a time axis.
+    colour : tuple of int
+        Red, green, blue.
+    width : float
+        Of its line, in points.
+    decimals : int
+        For people.
+    kind : Kind
+    aggregation : Aggregation
+        What overview levels keep.
+    published : bool
+        Whether page, console, `ctl status`, bridges and dashboard show it; such a column is aggregated.
+    """
+
+    name: str
+    label: str
+    description: str
+    plot: Plot
+    entity: str
+    colour: Colour = BLUE
+    width: float = 1.5
+    decimals: int = 2
+    kind: Kind = Kind.QUANTITY
+    aggregation: Aggregation = Aggregation.NONE
+    published: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Unit for people; empty for counts, codes and fractions."""
+        return unit_of(self.name)
+
+    @property
+    def title(self) -> str:
+        """Label and unit: `error, µm`."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
+    @property
+    def legend(self) -> str:
+        """Label and unit as the viewer's legend has room for: `error µm`."""
+        return f"{self.label} {self.unit}".rstrip()
+
+    def format_value(self, value: float | None) -> str:
+        """Return a value with its decimals; a dash for a missing one."""
+        if value is None or not math.isfinite(value):
+            return "-"
+        return f"{value:z.{self.decimals}f}"
+
+
+_TABLE_KEY = "column"
+
+
+def column(
+    label: str,
+    description: str,
+    plot: Plot,
+    entity: str,
+    *,
+    colour: Colour = BLUE,
+    width: float = 1.5,
+    decimals: int | None = None,
+    kind: Kind = Kind.QUANTITY,
+    aggregation: Aggregation | None = None,
+    published: bool = False,
+) -> Any:
+    """Return a dataclass field whose metadata is a row of the table; parameters as the attributes of `Column`.
+
+    A value that nothing sets is missing: NaN. Unless they are given, a quantity has two decimals, and overview levels
+    keep the last value of a code, and minimum, mean and maximum of a published column.
+    """
+    if decimals is None:
+        decimals = 2 if kind is Kind.QUANTITY else 0
+    if aggregation is None:
+        aggregation = _usual_aggregation(kind, published)
+    about = {
+        "label": label,
+        "description": description,
+        "plot": plot,
+        "entity": entity,
+        "colour": colour,
+        "width": width,
+        "decimals": decimals,
+        "kind": kind,
+        "aggregation": aggregation,
+        "published": published,
+    }
+    return field(default=math.nan, metadata={_TABLE_KEY: about})
+
+
+def _usual_aggregation(kind: Kind, published: bool) -> Aggregation:
+    if kind is Kind.CODE:
+        return Aggregation.LAST
+    return Aggregation.EXTREMES if published else Aggregation.NONE
+
+
+_EXTREMES = Aggregation.EXTREMES
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnValues:
+    """What one tick read, decided and wrote; NaN for missing values. Its fields are the table of columns."""
+
+    mono_s: float = column("time", "the run's clock at the start of the tick", RECORD, "", decimals=3)
+    tick: float = column("tick", "number of the tick, from 1", RECORD, "/tick/record", colour=GREY, kind=Kind.COUNT)
+    dt_s: float = column(
+        "time between ticks", "true time since the last tick, clamped", INTERVAL, "/tick/dt", decimals=4
+    )
+    lateness_ms: float = column(
+        "lateness", "start of the tick after its deadline", LATENESS, "/tick/lateness", decimals=1, published=True
+    )
+    missed_ticks: float = column(
+        "missed ticks",
+        "ticks missed so far in the run",
+        MISSED,
+        "/tick/missed",
+        colour=RED,
+        width=2.0,
+        kind=Kind.COUNT,
+        published=True,
+    )
+    state: float = column("state", "state of the controller", CODES, "/tick/record", colour=GREEN, kind=Kind.CODE)
+    shape_state: float = column(
+        "shape loop", "state of the shape loop", CODES, "/tick/record", colour=VIOLET, kind=Kind.CODE
+    )
+    safe_level: float = column(
+        "safe level", "safe level in force", CODES, "/tick/record", colour=YELLOW, kind=Kind.CODE
+    )
+    fault: float = column(
+        "fault",
+        "code of the standing fault; 0 without one",
+        CODES,
+        "/tick/record",
+        colour=RED,
+        kind=Kind.CODE,
+        aggregation=Aggregation.LARGEST,
+    )
+    target_um: float = column(
+        "target", "end of the setpoint's ramp", POSITION, "/loop/position", colour=WHITE, width=1.0, published=True
+    )
+    setpoint_um: float = column(
+        "setpoint", "setpoint of the loop, with the trim", POSITION, "/loop/position", colour=ORANGE, published=True
+    )
+    displacement_um: float = column(
+        "reading",
+        "reading of the laser; of the optics where they replace it",
+        POSITION,
+        "/loop/position",
+        colour=GREY,
+        width=1.0,
+        published=True,
+    )
+    filtered_um: float = column(
+        "process value",
+        "what the loop holds: the filtered reading, or the estimate of the centre",
+        POSITION,
+        "/loop/position",
+    )
+    error_um: float = column("error", "setpoint minus process value", ERROR, "/loop/error", published=True)
+    p_um_per_s: float = column("P", "proportional term", TERMS, "/loop/terms", decimals=3)
+    i_um_per_s: float = column("I", "integral term", TERMS, "/loop/terms", colour=ORANGE, decimals=3)
+    d_um_per_s: float = column("D", "derivative term", TERMS, "/loop/terms", colour=VIOLET, decimals=3)
+    feedforward_um_per_s: float = column(
+        "feed-forward",
+        "flow for known disturbances and the setpoint's ramp",
+        TERMS,
+        "/loop/terms",
+        colour=GREEN,
+        decimals=3,
+        aggregation=_EXTREMES,
+    )
+    flow_wanted_um_per_s: float = column(
+        "flow wanted", "flow that the loop asks for, before its limits", FLOW, "/loop/flow", colour=GREY, decimals=3
+    )
+    flow_um_per_s: float = column(
+        "flow", "the pump's flow, as motion of the centre", FLOW, "/loop/flow", decimals=3, published=True
+    )
+    pump_fraction: float = column(
+        "pump", "pump command, share of full scale", DRIVE, "/pump/drive", decimals=3, published=True
+    )
+    vent_fraction: float = column(
+        "vent", "vent command, share of full scale", DRIVE, "/pump/drive", colour=RED, decimals=3, published=True
+    )
+    pump_readback_fraction: float = column(
+        "pump read-back",
+        "pump command that the device reports",
+        DRIVE,
+        "/pump/drive",
+        colour=GREY,
+        width=1.0,
+        decimals=3,
+    )
+    vent_readback_fraction: float = column(
+        "vent read-back",
+        "vent command that the device reports",
+        DRIVE,
+        "/pump/drive",
+        colour=VIOLET,
+        width=1.0,
+        decimals=3,
+    )
+    gauge_pressure_pa: float = column(
+        "gauge pressure", "pressure in the mirror above ambient", GAUGE, "/gas/pressure", decimals=1, published=True
+    )
+    ambient_pressure_pa: float = column(
+        "ambient pressure",
+        "reading of the barometer",
+        AMBIENT,
+        "/ambient/pressure",
+        colour=ORANGE,
+        decimals=1,
+        published=True,
+    )
+    air_temperature_c: float = column(
+        "air temperature",
+        "temperature of the air around the mirror",
+        TEMPERATURES,
+        "/ambient/temperature",
+        colour=ORANGE,
+        published=True,
+    )
+    gas_temperature_c: float = column(
+        "gas temperature", "temperature of the gas in the mirror", TEMPERATURES, "/gas/temperature", published=True
+    )
+    displacement_quality: float = column(
+        "displacement quality",
+        "quality code of the laser's reading; 0 is good",
+        RECORD,
+        "/tick/record",
+        colour=RED,
+        decimals=0,
+        aggregation=_EXTREMES,
+    )
+    sample_counter: float = column(
+        "sample counter", "the board's count of its samples", RECORD, "/tick/record", kind=Kind.COUNT
+    )
+    device_time_s: float = column(
+        "device time", "the board's clock at its sample", RECORD, "/tick/record", colour=ORANGE, decimals=3
+    )
+    leak_um_per_s: float = column(
+        "leak",
+        "estimated leak, as motion of the centre",
+        FLOW,
+        "/loop/flow",
+        colour=RED,
+        width=2.0,
+        decimals=3,
+        published=True,
+    )
+    trim_um: float = column(
+        "trim", "the shape loop's part of the setpoint", TRIM, "/shape/trim", colour=VIOLET, width=2.0, published=True
+    )
+    truth_displacement_um: float = column(
+        "true centre",
+        "true displacement of the centre; twin only",
+        POSITION,
+        "/truth/displacement",
+        colour=GREEN,
+        width=2.0,
+    )
+    truth_laser_bias_um: float = column(
+        "true drift of the laser's mount",
+        "part of the reading that is no motion of the mirror; twin only",
+        RECORD,
+        "/truth/laser_bias",
+        colour=RED,
+    )
+    # the estimate of the centre (docs/estimator.md), which is then the process value
+    estimate_sigma_um: float = column(
+        "estimate of the centre, 1 σ",
+        "standard deviation of the estimate; missing where the laser is held",
+        ESTIMATE_SIGMA,
+        "/estimate/sigma",
+        decimals=3,
+    )
+    optics_share: float = column(
+        "share of the optics",
+        "share of the optics in the estimate's corrections; the laser has the rest",
+        OPTICS_SHARE,
+        "/estimate/optics_share",
+        decimals=3,
+    )
+    laser_innovation: float = column(
+        "laser innovation",
+        "reading less expectation, in standard deviations; missing while it is not used",
+        INNOVATIONS,
+        "/estimate/innovations",
+        colour=GREY,
+        width=1.0,
+    )
+    optics_innovation: float = column("optics innovation", "as the laser's", INNOVATIONS, "/estimate/innovations")
+    barometer_innovation: float = column(
+        "barometer innovation", "as the laser's", INNOVATIONS, "/estimate/innovations", colour=ORANGE, width=1.0
+    )
+    thermometer_innovation: float = column(
+        "thermometer innovation", "as the laser's", INNOVATIONS, "/estimate/innovations", colour=RED, width=1.0
+    )
+    interlocks_open: float = column(
+        "open interlocks",
+        "bit i: interlock i of the configuration is open or lost; missing without interlocks or without a reading",
+        RECORD,
+        "/interlocks/open",
+        colour=RED,
+        decimals=0,
+    )
+
+
+COLUMNS: dict[str, Column] = {
+    each.name: Column(each.name, **each.metadata[_TABLE_KEY]) for each in fields(ColumnValues)
+}
+
+# For people, group by group.
+PUBLISHED: tuple[Column, ...] = tuple(
+    each for group in Group for each in COLUMNS.values() if each.published and each.plot.group is group
+)
+
+# Computed where it is shown (`telemetry.true_error_um`).
+TRUE_ERROR = Column(
+    "true_error_um",
+    "true error",
+    "target minus true centre; twin only",
+    ERROR,
+    "/truth/error",
+    colour=GREEN,
+    width=2.0,
+    aggregation=_EXTREMES,
+)
