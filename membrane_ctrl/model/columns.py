@@ -112,7 +112,7 @@ RECORD = Plot("Record", Group.RECORD)
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class TelemetryColumn:
     """A column of telemetry.
 
     Attributes
@@ -191,7 +191,7 @@ def column(
     aggregation: Aggregation | None = None,
     published: bool = False,
 ) -> Any:
-    """Return a dataclass field whose metadata is a row of the table; parameters as the attributes of `Column`.
+    """Return a dataclass field whose metadata is a row of the table. Parameters: see `TelemetryColumn`.
 
     A value that nothing sets is missing: NaN. Unless they are given, a quantity has two decimals, and overview levels
     keep the last value of a code, and minimum, mean and maximum of a published column.
@@ -432,17 +432,17 @@ class ColumnValues:
     )
 
 
-COLUMNS: dict[str, Column] = {
-    each.name: Column(each.name, **each.metadata[_TABLE_KEY]) for each in fields(ColumnValues)
+COLUMNS: dict[str, TelemetryColumn] = {
+    each.name: TelemetryColumn(each.name, **each.metadata[_TABLE_KEY]) for each in fields(ColumnValues)
 }
 
 # For people, group by group.
-PUBLISHED: tuple[Column, ...] = tuple(
+PUBLISHED: tuple[TelemetryColumn, ...] = tuple(
     each for group in Group for each in COLUMNS.values() if each.published and each.plot.group is group
 )
 
 # Computed where it is shown (`telemetry.true_error_um`).
-TRUE_ERROR = Column(
+TRUE_ERROR_COLUMN = TelemetryColumn(
     "true_error_um",
     "true error",
     "target minus true centre; twin only",

@@ -1,4 +1,4 @@
-"""Telemetry as people see it: the Rerun entity of each field, the names of codes, tables with UTC.
+"""Telemetry as the viewer gets it: the Rerun entities of the table of columns, lines for events, tables with UTC.
 
 The signals of one plot share one entity: m scalars of one cost the writer and the viewer far less than m entities of
 one. `SeriesLines` sets the names of the lines once.
@@ -17,20 +17,10 @@ from numpy.typing import NDArray
 from membrane_ctrl.controller import safety
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
+from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, TelemetryColumn
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import Rows, column
-
-Colour = tuple[int, int, int]
-
-# One colour per quantity in every plot (Okabe and Ito's palette, safe for colour-blind readers).
-BLUE: Colour = (86, 180, 233)
-ORANGE: Colour = (230, 159, 0)
-GREEN: Colour = (0, 158, 115)
-RED: Colour = (213, 94, 0)
-VIOLET: Colour = (204, 121, 167)
-YELLOW: Colour = (240, 228, 66)
-GREY: Colour = (140, 140, 140)
-WHITE: Colour = (235, 235, 235)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,84 +45,23 @@ class Stream:
         return np.stack([column(rows, line.field) for line in self.lines], axis=1)
 
 
-# Every field of a row except `mono_s`, the time axis, is in exactly one stream.
-STREAMS: tuple[Stream, ...] = (
-    Stream(
-        "/loop/position",
-        (
-            Line("displacement_um", "reading µm", GREY, 1.0),
-            Line("filtered_um", "filtered µm", BLUE),
-            Line("setpoint_um", "setpoint µm", ORANGE),
-            Line("target_um", "target µm", WHITE, 1.0),
-        ),
-    ),
-    Stream("/truth/displacement", (Line("truth_displacement_um", "true centre µm", GREEN, 2.0),)),
-    Stream("/truth/laser_bias", (Line("truth_laser_bias_um", "true laser mount drift µm", RED),)),
-    Stream("/loop/error", (Line("error_um", "error µm", BLUE),)),
-    Stream(
-        "/loop/terms",
-        (
-            Line("p_um_per_s", "P µm/s", BLUE),
-            Line("i_um_per_s", "I µm/s", ORANGE),
-            Line("d_um_per_s", "D µm/s", VIOLET),
-            Line("feedforward_um_per_s", "feed-forward µm/s", GREEN),
-        ),
-    ),
-    Stream(
-        "/loop/flow",
-        (
-            Line("flow_wanted_um_per_s", "flow wanted µm/s", GREY),
-            Line("flow_um_per_s", "flow µm/s", BLUE),
-            Line("leak_um_per_s", "leak µm/s", RED, 2.0),
-        ),
-    ),
-    Stream(
-        "/pump/drive",
-        (
-            Line("pump_fraction", "pump", BLUE),
-            Line("pump_readback_fraction", "pump read-back", GREY, 1.0),
-            Line("vent_fraction", "vent", RED),
-            Line("vent_readback_fraction", "vent read-back", VIOLET, 1.0),
-        ),
-    ),
-    Stream("/estimate/sigma", (Line("estimate_sigma_um", "estimate of the centre, 1 sigma µm", BLUE),)),
-    Stream(
-        "/estimate/innovations",
-        (
-            Line("laser_innovation", "laser", GREY, 1.0),
-            Line("barometer_innovation", "barometer", ORANGE, 1.0),
-            Line("thermometer_innovation", "thermometer", RED, 1.0),
-            Line("optics_innovation", "optics", BLUE),
-        ),
-    ),
-    Stream("/estimate/optics_share", (Line("optics_share", "share of the optics", BLUE),)),
-    Stream("/interlocks/open", (Line("interlocks_open", "open interlocks, a bit each", RED),)),
-    Stream("/shape/trim", (Line("trim_um", "trim µm", VIOLET, 2.0),)),
-    Stream("/gas/pressure", (Line("gauge_pressure_pa", "gauge pressure Pa", BLUE),)),
-    Stream("/ambient/pressure", (Line("ambient_pressure_pa", "ambient pressure Pa", ORANGE),)),
-    Stream("/ambient/temperature", (Line("air_temperature_c", "air °C", ORANGE),)),
-    Stream("/gas/temperature", (Line("gas_temperature_c", "gas °C", BLUE),)),
-    Stream("/tick/lateness", (Line("lateness_ms", "lateness ms", BLUE),)),
-    Stream("/tick/dt", (Line("dt_s", "time between ticks s", BLUE),)),
-    Stream("/tick/missed", (Line("missed_ticks", "ticks missed so far", RED, 2.0),)),
-    # for programs rather than people: one entity, as each costs 32 bytes per row for its times and row id
-    Stream(
-        "/tick/record",
-        (
-            Line("tick", "tick", GREY),
-            Line("sample_counter", "sample counter", BLUE),
-            Line("device_time_s", "device time s", ORANGE),
-            Line("displacement_quality", "displacement quality", RED),
-            Line("state", "state", GREEN),
-            Line("shape_state", "shape state", VIOLET),
-            Line("safe_level", "safe level", YELLOW),
-            Line("fault", "fault", RED),
-        ),
-    ),
-)
+def _line(each: TelemetryColumn) -> Line:
+    return Line(each.name, each.legend, each.colour, each.width)
+
+
+def _telemetry_streams() -> tuple[Stream, ...]:
+    by_entity: dict[str, list[Line]] = {}
+    for each in COLUMNS.values():
+        if each.entity:
+            by_entity.setdefault(each.entity, []).append(_line(each))
+    return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
+
+
+# Every column except `mono_s`, the time axis, is in exactly one stream.
+STREAMS: tuple[Stream, ...] = _telemetry_streams()
 
 # Computed here from the rows, so that plots need no arithmetic.
-TRUE_ERROR = Stream("/truth/error", (Line("", "target minus true centre µm", GREEN, 2.0),))
+TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_line(TRUE_ERROR_COLUMN),))
 OVERVIEW = Stream(
     "/overview/error",
     (
@@ -143,10 +72,7 @@ OVERVIEW = Stream(
 )
 # A point per second all over the run: the others have every tick around events and one per second in quiet times, and
 # a line that changes its density looks as if the mirror had changed.
-_MEANS = frozenset({
-    "/loop/position", "/truth/displacement", "/loop/flow", "/pump/drive", "/gas/pressure", "/gas/temperature",
-    "/ambient/pressure", "/ambient/temperature",
-})  # fmt: skip
+_MEANS = frozenset(each.entity for each in COLUMNS.values() if each.plot.means)
 MEANS = tuple(replace(stream, path=f"/overview{stream.path}") for stream in STREAMS if stream.path in _MEANS)
 TRUE_MEAN = replace(TRUE_ERROR, path="/overview/truth/error")
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)

@@ -6,10 +6,10 @@ from dataclasses import fields
 
 import pytest
 
-from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR, Aggregation, Column, Group, Kind, unit_of
+from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Group, Kind, TelemetryColumn, unit_of
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
-EVERY = [*COLUMNS.values(), TRUE_ERROR]
+EVERY = [*COLUMNS.values(), TRUE_ERROR_COLUMN]
 
 
 def test_every_field_of_a_row_is_a_column_in_the_same_order() -> None:
@@ -92,4 +92,4 @@ def test_values_for_people() -> None:
 
 
 def test_a_column_without_a_unit_suffix_has_no_unit() -> None:
-    assert Column("gusts", "gusts", "count of gusts", TRUE_ERROR.plot, "/x").title == "gusts"
+    assert TelemetryColumn("gusts", "gusts", "count of gusts", TRUE_ERROR_COLUMN.plot, "/x").title == "gusts"

@@ -14,6 +14,7 @@ import rerun as rr
 
 from membrane_ctrl.model import events, telemetry
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
+from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
 from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
@@ -31,31 +32,28 @@ LEVEL_ROWS_MOST = 50_000
 OVERVIEW_ROWS_MOST = 5_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
-_RUN_COLOURS: tuple[streams.Colour, ...] = (streams.BLUE, streams.ORANGE, streams.GREEN, streams.VIOLET, streams.RED)
+_RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 
 
 # Plots of a level: signals (column, name, colour) by path.
-OVERVIEWS: dict[str, tuple[tuple[str, str, streams.Colour], ...]] = {
+OVERVIEWS: dict[str, tuple[tuple[str, str, Colour], ...]] = {
     "/overview/error": (
-        ("min_error_um", "error, minimum µm", streams.GREY),
-        ("mean_error_um", "error, mean µm", streams.BLUE),
-        ("max_error_um", "error, maximum µm", streams.GREY),
+        ("min_error_um", "error, minimum µm", GREY),
+        ("mean_error_um", "error, mean µm", BLUE),
+        ("max_error_um", "error, maximum µm", GREY),
     ),
-    "/overview/true": (("mean_true_error_um", "true error, mean µm", streams.GREEN),),
-    "/overview/flow": (
-        ("mean_flow_um_per_s", "flow µm/s", streams.BLUE),
-        ("mean_leak_um_per_s", "leak µm/s", streams.RED),
-    ),
-    "/overview/pump": (("mean_pump_fraction", "pump", streams.BLUE),),
-    "/overview/trim": (("mean_trim_um", "trim µm", streams.VIOLET),),
-    "/overview/ambient": (("mean_ambient_pressure_pa", "air pressure Pa", streams.BLUE),),
-    "/overview/gauge": (("mean_gauge_pressure_pa", "gauge pressure Pa", streams.BLUE),),
-    "/overview/temperature": (("mean_air_temperature_c", "air °C", streams.ORANGE),),
+    "/overview/true": (("mean_true_error_um", "true error, mean µm", GREEN),),
+    "/overview/flow": (("mean_flow_um_per_s", "flow µm/s", BLUE), ("mean_leak_um_per_s", "leak µm/s", RED)),
+    "/overview/pump": (("mean_pump_fraction", "pump", BLUE),),
+    "/overview/trim": (("mean_trim_um", "trim µm", VIOLET),),
+    "/overview/ambient": (("mean_ambient_pressure_pa", "air pressure Pa", BLUE),),
+    "/overview/gauge": (("mean_gauge_pressure_pa", "gauge pressure Pa", BLUE),),
+    "/overview/temperature": (("mean_air_temperature_c", "air °C", ORANGE),),
     "/overview/lateness": (
-        ("mean_lateness_ms", "lateness, mean ms", streams.BLUE),
-        ("max_lateness_ms", "lateness, maximum ms", streams.GREY),
+        ("mean_lateness_ms", "lateness, mean ms", BLUE),
+        ("max_lateness_ms", "lateness, maximum ms", GREY),
     ),
-    "/overview/missed": (("max_missed_ticks", "ticks missed so far", streams.RED),),
+    "/overview/missed": (("max_missed_ticks", "ticks missed so far", RED),),
 }
 
 
@@ -63,10 +61,10 @@ _COLOUR_WORDS = (
     "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
 )
 _SIGNED = {"Pa", "um", "%"}
-_OTHER_FOUND: streams.Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
+_OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
 _FOUND_COLOURS = {
-    "pressure step": streams.VIOLET, "leak step": streams.ORANGE, "noise change": streams.ORANGE,
-    "shape jump": streams.BLUE,
+    "pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE,
+    "shape jump": BLUE,
 }  # fmt: skip
 
 
@@ -136,7 +134,7 @@ class Layer:
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         band = streams.band(band_um)
         square = np.full((ends.size, 1), band_um**2)
-        self._measured(band.path, [(band.lines[0].name, streams.GREEN)], ends, np.zeros_like(square), square, 0.0)
+        self._measured(band.path, [(band.lines[0].name, GREEN)], ends, np.zeros_like(square), square, 0.0)
 
     def _ticks(self, run: Run, part_s: tuple[float, float]) -> None:
         rows_expected = run.config.loop.rate_hz * (min(part_s[1], _end_s(run)) - max(part_s[0], 0.0))
@@ -210,7 +208,7 @@ class Layer:
         variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
         lines = [(line.name, line.colour) for line in streams.SAG.lines]
         self._measured("/shape/sag_change", lines, shown.time_s, change, variances)
-        self._style("/shape/residual", [("slope residual µrad", streams.BLUE)])
+        self._style("/shape/residual", [("slope residual µrad", BLUE)])
         self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
@@ -253,7 +251,7 @@ class Layer:
     def _page(self, path: str, text: str) -> None:
         self._stream.log(self._prefix + path, rr.TextDocument(text, media_type="text/markdown"), static=True)
 
-    def _named(self, lines: Iterable[tuple[str, streams.Colour]], width: float) -> dict[str, Any]:
+    def _named(self, lines: Iterable[tuple[str, Colour]], width: float) -> dict[str, Any]:
         """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs apart."""
         names, colours = zip(*lines, strict=True)
         if self._prefix:
@@ -263,14 +261,14 @@ class Layer:
         }  # fmt: skip
 
     def _style(
-        self, path: str, lines: Iterable[tuple[str, streams.Colour]], width: float = 1.5, vertical: bool = False
+        self, path: str, lines: Iterable[tuple[str, Colour]], width: float = 1.5, vertical: bool = False
     ) -> None:
         # the average of the lines in a pixel would be none
         style = rr.SeriesLines(**self._named(lines, width), aggregation_policy="Off" if vertical else None)
         self._stream.log(self._prefix + path, style, static=True)
 
     def _measured(
-        self, path: str, lines: Iterable[tuple[str, streams.Colour]], time_s: Column, values: Column,
+        self, path: str, lines: Iterable[tuple[str, Colour]], time_s: Column, values: Column,
         variances: Column, width: float = 1.5,
     ) -> None:  # fmt: skip
         """Log values with a shaded area of one standard deviation."""
@@ -323,10 +321,10 @@ def _variances(cycles: shapes.Shapes) -> Column:
     return np.diagonal(cycles.covariance_um2, axis1=1, axis2=2)[np.maximum(place, 0)]
 
 
-def _of_run(colour: streams.Colour, number: int) -> streams.Colour:
+def _of_run(colour: Colour, number: int) -> Colour:
     """Colours of overlaid runs; a signal that is grey in a single run gets the dark shade."""
     red, green, blue = _RUN_COLOURS[number % len(_RUN_COLOURS)]
-    return (red // 2, green // 2, blue // 2) if colour == streams.GREY else (red, green, blue)
+    return (red // 2, green // 2, blue // 2) if colour == GREY else (red, green, blue)
 
 
 def _nanoseconds(time_s: Column) -> AnyArray:
