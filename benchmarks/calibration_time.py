@@ -5,7 +5,6 @@ A person waits for the clock time; on a busy machine only the CPU time can be co
 
 from __future__ import annotations
 
-import resource
 import tempfile
 import time
 from pathlib import Path
@@ -17,6 +16,7 @@ from membrane_ctrl.metrology.calibrate.solve import solve
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
+from tests.support.peak_memory import peak_mb
 
 STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0)
 
@@ -24,8 +24,7 @@ STATED = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_disp
 def run() -> list[Figure]:
     """Ten sets of a quarter of the resolution, and five full ones, read and solved."""
     rows = [*_time(4, 10, 10.0), *_time(1, 5, 60.0)]
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return [*rows, at_most("memory of the process", peak_mb, "MB", 2000)]
+    return [*rows, at_most("memory of the process", peak_mb(), "MB", 2000)]
 
 
 def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:

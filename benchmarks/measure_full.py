@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
 import time
 
@@ -16,6 +15,7 @@ from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence
+from tests.support.peak_memory import peak_mb
 
 FILM = typical_film(37.1, 500.0, seed=1)
 
@@ -57,7 +57,7 @@ def _measured(shrink: int) -> tuple[FullResult, float, float]:
         _measure(stack, optics)
         seconds.append(time.perf_counter() - begin)
     result = _measure(stack, optics)
-    return result, statistics.median(seconds[1:]), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return result, statistics.median(seconds[1:]), peak_mb()
 
 
 def _measure(stack: FrameStack, optics: OpticsConfig) -> FullResult:

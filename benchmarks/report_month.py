@@ -8,7 +8,6 @@ for as long as the benchmark runs only.
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -22,18 +21,18 @@ from benchmarks.figures import Figure, at_most
 from benchmarks.nights import RATE_HZ, night, planted, write_run
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
+from tests.support.peak_memory import peak_mb
 
 MONTH_DAYS = 30.0
 # Written part by part: a part is this long, and only one is in memory.
 _PART_HOURS = 6.0
 _CHILD = """
-import json, resource, sys, time
-from pathlib import Path
+import json, sys, time
 from membrane_ctrl.cli import run
+from tests.support.peak_memory import peak_mb
 began = time.monotonic()
 code = run(sys.argv[1:])
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-print(json.dumps({"code": code, "took_s": time.monotonic() - began, "peak_gb": peak}))
+print(json.dumps({"code": code, "took_s": time.monotonic() - began, "peak_gb": peak_mb() / 1e3}))
 """
 
 
@@ -89,4 +88,4 @@ if __name__ == "__main__":
     from benchmarks.figures import show
 
     show("report_month", run(float(sys.argv[1]) if len(sys.argv) > 1 else MONTH_DAYS))
-    print(f"own peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+    print(f"own peak {peak_mb() / 1e3:.2f} GB")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from firmware_iface.display import ScreenRaster, pattern_light
-from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import Config
@@ -26,7 +25,7 @@ from membrane_ctrl.processes.frames import FrameRing
 from membrane_ctrl.processes.ring import RingReader, ring
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
@@ -75,11 +74,7 @@ def stack() -> Iterator[ExitStack]:
 @pytest.fixture
 def camera(stack: ExitStack, tmp_path: Path) -> GigeCameraEmulator:
     framebuffer = stack.enter_context(virtual_display(tmp_path, SCREEN["width_px"], SCREEN["height_px"]))  # type: ignore[arg-type]
-    try:
-        emulator = GigeCameraEmulator(Sight(framebuffer).expose, 306, 256)
-        return stack.enter_context(emulator)
-    except LinkError as error:  # the library is not there, or another run of the tests has the standard's one port
-        pytest.skip(str(error))
+    return stack.enter_context(gige_camera(Sight(framebuffer).expose, 306, 256))
 
 
 class Run:

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
-from firmware_iface.roles import LinkError
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.sim.lab import Lab
-from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
@@ -72,12 +71,8 @@ def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
     optics, screen = EXAMPLE.optics.camera, EXAMPLE.devices.screen
     with virtual_display(tmp_path, screen.width_px, screen.height_px) as framebuffer:
         sight = Sight(framebuffer, optics.width_px, optics.height_px)
-        try:
-            emulator = GigeCameraEmulator(sight.expose, optics.width_px, optics.height_px)
-            with emulator:
-                yield emulator
-        except LinkError as error:  # the library is not there, or another run of the tests has the one port
-            pytest.skip(str(error))
+        with gige_camera(sight.expose, optics.width_px, optics.height_px) as emulator:
+            yield emulator
 
 
 async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
+from tests.support.machine_needs import require
 
 FIRMWARE = Path(__file__).parents[2] / "firmware_iface" / "board"
 
@@ -18,9 +17,7 @@ def built(target: str, folder: Path, *tools: str) -> Path:
     BOARD_BUILD names another folder, whose content is kept (`make board` measures the coverage there).
     """
     folder = Path(os.environ.get("BOARD_BUILD", folder))
-    for tool in ("make", *tools):
-        if shutil.which(tool) is None:
-            pytest.skip(f"no {tool} on this machine: `make board` installs it")
+    require("make", *tools)
     subprocess.run(
         ["make", "--silent", "-C", str(FIRMWARE), f"OUT={folder}", str(folder / target)],
         check=True, capture_output=True, text=True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from tests.board.build_board import built
 from tests.board.film_wire import FilmWire
 from tests.board.still_film import StillFilm
 from tests.board.virtual_board import AT_REST, NO_VALUE, SETTINGS, VirtualBoard, VirtualLink
+from tests.support.machine_needs import needs
 
 _FINDINGS = 22
 
@@ -121,7 +121,7 @@ def test_tcp_clients_of_every_kind(host_board: dict[str, str]) -> None:
 
 
 @pytest.mark.real_time
-@pytest.mark.skipif(shutil.which("mbpoll") is None, reason="no mbpoll: `make board` installs it")
+@needs("mbpoll")
 @pytest.mark.parametrize("line", ["rtu", "tcp"])
 def test_a_client_that_is_not_ours_reads_and_stops(host_board: dict[str, str], line: str) -> None:
     """mbpoll, over libmodbus."""

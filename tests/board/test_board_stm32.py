@@ -29,6 +29,7 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.lasers import three_bytes
 from tests.board.gdb_wire import StoppedBoard, stopped
 from tests.board.qemu_board import addresses
+from tests.support.machine_needs import require
 
 PORT = Path(__file__).parents[2] / "firmware_iface" / "board" / "port_stm32f4"
 NO_VALUE = -(2**31)
@@ -39,9 +40,7 @@ CCR1, CCR2 = 0x40000434, 0x40000438
 
 def make(folder: Path, *targets: str) -> list[Path]:
     """Build targets of the port's Makefile in a folder."""
-    for tool in ("make", "arm-none-eabi-gcc", "qemu-system-arm"):
-        if shutil.which(tool) is None:
-            pytest.skip(f"no {tool} on this machine")
+    require("make", "arm-none-eabi-gcc", "qemu-system-arm")
     paths = [folder / target for target in targets]
     words = ["make", "--silent", "-C", PORT, f"OUT={folder}", f"PYTHON={sys.executable}", *paths]
     subprocess.run([str(word) for word in words], check=True, capture_output=True, text=True)
@@ -258,6 +257,7 @@ void hal_unlock(uint32_t before) { (void)before; }
 @pytest.fixture(scope="module")
 def laser_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """laser.c for this machine."""
+    require("cc")
     folder = tmp_path_factory.mktemp("laser")
     (folder / "host.c").write_text(HOST)
     words = [

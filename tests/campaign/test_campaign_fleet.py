@@ -21,11 +21,12 @@ import pytest
 
 from benchmarks.figures import Figure, at_most, show
 from tests.support.browser import Tab, browser_tab
+from tests.support.machine_needs import needs
 from tests.support.slowed_holds import slowed_holds
 from tests.web.test_fleet import fleet_file
-from tests.web.test_page import needs_browser, served
+from tests.web.test_page import served
 
-pytestmark = [pytest.mark.real_time, pytest.mark.campaign, needs_browser]
+pytestmark = [pytest.mark.real_time, pytest.mark.campaign, needs("chromium")]
 NAMES = [f"mirror{number}" for number in range(20)]
 SLOWNESS, RATE_HZ = 4.0, 50.0
 SETTLES_S, PHASE_S, CYCLES = 90.0, 30.0, 2

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 from collections.abc import Iterator
 
 import pytest
 from systemd_room import Room, missing, systemd_room
+
+from tests.support.machine_needs import needs
 
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(300)]
 
@@ -190,7 +191,7 @@ def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: 
     room.until(lambda: room.settled("inactive"))
 
 
-@pytest.mark.skipif(not all(map(shutil.which, ("Xvfb", "xauth", "xhost", "xdpyinfo"))), reason="needs an X server")
+@needs("Xvfb", "xauth", "xhost", "xdpyinfo")
 def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
     unit = "/opt/source/membrane_ctrl/examples/membrane-ctrl.service"
     edits = "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e '/^Restart/d'"

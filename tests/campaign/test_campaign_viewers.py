@@ -14,9 +14,9 @@ import pytest
 from benchmarks import viewers
 from benchmarks.figures import at_most, show
 from tests.support.browser import browser_tab
-from tests.web.test_page import needs_browser
+from tests.support.machine_needs import needs
 
-pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(900), needs_browser]
+pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(900), needs("chromium")]
 # the error changes with every update; kept over a reload of the page, which a browser does that was hung up on
 WATCHED = """sessionStorage.loads = +(sessionStorage.loads || 0) + 1;
 new MutationObserver(changes => {

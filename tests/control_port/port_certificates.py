@@ -6,6 +6,8 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.support.machine_needs import require
+
 CA_CONFIG = """
 [ca]
 default_ca = own
@@ -24,6 +26,7 @@ organizationalUnitName = optional
 
 
 def openssl(folder: Path, *arguments: str) -> None:
+    require("openssl")
     subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True, timeout=120)
 
 

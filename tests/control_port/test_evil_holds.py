@@ -102,24 +102,19 @@ def test_an_endless_line_takes_neither_memory_nor_time(greets: bool, tmp_path: P
         )
         took_s = time.monotonic() - began_s
     assert done.returncode == 4, done.stderr
-    grown_kb = int(done.stdout)
-    assert grown_kb < 20_000
+    assert float(done.stdout) < 20
     assert took_s < 30.0
     assert "65536 bytes" in done.stderr
 
 
-# Its own peak: `ru_maxrss` begins with that of the process which started this one.
 _STATUS_AND_MEMORY = """
 import sys
-from pathlib import Path
 from membrane_ctrl.cli import run
 from membrane_ctrl.control_port import ctl
-def peak_kb():
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
-before = peak_kb()
+from tests.support.peak_memory import peak_mb, reset_peak
+before_mb = reset_peak()
 code = run(["ctl", "status", "--socket", sys.argv[1]])
-print(peak_kb() - before)
+print(peak_mb() - before_mb)
 sys.exit(code)
 """
 

@@ -19,8 +19,9 @@ from membrane_ctrl.control_port import ctl
 from membrane_ctrl.control_port.ctl import fleet
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.web.feed import HoldFeed
+from tests.support.machine_needs import needs
 
-pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
+pytestmark = needs("openssl")
 
 SAID = {  # what the line of each says, besides its address
     "north": "as it should be",

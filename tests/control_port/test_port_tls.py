@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import socket
 import ssl
 import time
@@ -18,8 +17,9 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.sockets import TlsListener, client_context
 from membrane_ctrl.model.errors import DeviceError, InputError
+from tests.support.machine_needs import needs
 
-pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
+pytestmark = needs("openssl")
 
 
 @pytest.fixture(scope="module")

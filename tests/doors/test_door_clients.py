@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shutil
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -18,15 +17,12 @@ import pytest
 from benchmarks.doors import lines
 from membrane_ctrl.doors.names import TABLE
 from tests.control_port.port_run import PortRun, port_run
+from tests.support.machine_needs import needs, program_path
 from tests.web.test_page import free_port, ticking
 
-MOSQUITTO = shutil.which("mosquitto") or ("/usr/sbin/mosquitto" if Path("/usr/sbin/mosquitto").exists() else None)
 PATIENCE_S = 180.0
 NO_NUMBER = "is not a plain decimal number such as -1.5 or 2e-3"
-pytestmark = [
-    pytest.mark.real_time,
-    pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto: apt-get install mosquitto mosquitto-clients"),
-]
+pytestmark = [pytest.mark.real_time, needs("mosquitto", "mosquitto_pub", "mosquitto_sub")]
 
 
 @asynccontextmanager
@@ -61,8 +57,7 @@ async def doors(folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Pro
 
 @asynccontextmanager
 async def broker(port: int) -> AsyncIterator[None]:
-    assert MOSQUITTO is not None
-    async with program(MOSQUITTO, "-p", str(port)):
+    async with program(program_path("mosquitto"), "-p", str(port)):
         async with asyncio.timeout(PATIENCE_S):
             while True:
                 try:

@@ -8,7 +8,6 @@ import dataclasses
 import json
 import os
 import random
-import resource
 import signal
 import time
 from collections.abc import AsyncIterator, Callable
@@ -28,14 +27,13 @@ from membrane_ctrl.doors.names import Door
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.telemetry import State
 from tests.control_port.port_run import PortRun, port_run
-from tests.doors.test_door_clients import MOSQUITTO, broker, program
+from tests.doors.test_door_clients import broker, program
 from tests.doors.test_doors import STRANGE_NUMBERS, door_with, seen_hold
+from tests.support.machine_needs import needs, program_path
+from tests.support.peak_memory import peak_mb, reset_peak
 from tests.web.test_page import free_port
 
-pytestmark = [
-    pytest.mark.real_time,
-    pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto: apt-get install mosquitto mosquitto-clients"),
-]
+pytestmark = [pytest.mark.real_time, needs("mosquitto")]
 BASE = "membrane/mirror"
 ANSWER_S = 1.0
 PATIENCE_S = 30.0
@@ -416,9 +414,8 @@ async def test_a_bridge_ends_though_its_broker_hangs_or_dies_at_that_moment(
     tmp_path: Path, trouble: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mqtt, "_ANSWER_S", 1.0)
-    assert MOSQUITTO is not None
     port = free_port()
-    async with program(MOSQUITTO, "-p", str(port)) as process:
+    async with program(program_path("mosquitto"), "-p", str(port)) as process:
         door = door_to(tmp_path)
         task = asyncio.create_task(mqtt.serve(MqttConfig(port=port, discovery_prefix=""), door))
         async with contextlib.AsyncExitStack() as stack:
@@ -450,7 +447,7 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
 
     port = free_port()
     server = await asyncio.start_server(serve, "127.0.0.1", port)
-    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before_mb = reset_peak()
     door = door_to(tmp_path)
     async with port_run(tmp_path) as run, serving(port, door) as task:
         begin_s = time.monotonic()
@@ -463,7 +460,7 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
         assert not task.done()
     server.close()
     assert connections <= 4.0 / mqtt._AGAIN_S + 2
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 20_000
+    assert peak_mb() - before_mb < 20
     assert len(capsys.readouterr().err.splitlines()) <= 3, "one line, not one for each attempt"
 
 

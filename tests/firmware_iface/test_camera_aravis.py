@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
@@ -16,7 +15,8 @@ from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.links import aravis
 from firmware_iface.roles import DeviceRefusedError, FrameLostError, LinkDownError, LinkError
 from firmware_iface.settings import AravisCameraConfig
-from tests.support.gige_camera import GigeCameraEmulator
+from tests.support.gige_camera import GigeCameraEmulator, gige_camera
+from tests.support.machine_needs import program_path
 
 pytestmark = pytest.mark.real_time
 
@@ -47,13 +47,8 @@ def sight() -> Sight:
 
 @pytest.fixture
 def emulator(sight: Sight) -> Iterator[GigeCameraEmulator]:
-    try:
-        emulated = GigeCameraEmulator(sight.expose, WIDTH_PX, HEIGHT_PX)
-        emulated.plug_in()
-    except LinkError as error:  # the library is not there, or another run of the tests has the standard's one port
-        pytest.skip(str(error))
-    yield emulated
-    emulated.unplug()
+    with gige_camera(sight.expose, WIDTH_PX, HEIGHT_PX) as emulated:
+        yield emulated
     assert emulated.error is None
 
 
@@ -213,9 +208,7 @@ def test_discovery_names_it(emulator: GigeCameraEmulator) -> None:
 
 
 def test_aravis_own_tool_gets_frames(emulator: GigeCameraEmulator) -> None:
-    tool = shutil.which("arv-camera-test-0.8")
-    if tool is None:
-        pytest.skip("aravis' tools are not installed: apt install aravis-tools")
+    tool = program_path("arv-camera-test-0.8")
     options = f"-n 127.0.0.1 -w {WIDTH_PX} -h {HEIGHT_PX} -i 8000 -e 2000 -o 20 -a --no-packet-socket --duration=2"
     said = subprocess.run([tool, *options.split()], capture_output=True, text=True, timeout=120, check=True).stdout
     assert "EMU1" in said

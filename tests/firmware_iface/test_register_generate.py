@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from firmware_iface import generate
 from firmware_iface.register_map import default_map
+from tests.support.machine_needs import needs
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -31,7 +31,7 @@ def test_check_reports_a_stale_file_and_writes_nothing(
     assert generate.main(["--check"]) == 0
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+@needs("cc")
 def test_c_header_compiles_and_agrees_with_the_map(tmp_path: Path) -> None:
     registers = default_map()
     wanted = {f"{register.name.upper()}_ADDRESS": register.address for register in registers}
@@ -56,6 +56,6 @@ def test_c_header_compiles_and_agrees_with_the_map(tmp_path: Path) -> None:
     )
     program = tmp_path / "main"
     flags = ["-std=c89", "-Wall", "-Wextra", "-Werror", "-pedantic", f"-I{generate.HEADER_PATH.parent}"]
-    subprocess.run(["gcc", *flags, str(source), "-o", str(program)], check=True, capture_output=True, text=True)
+    subprocess.run(["cc", *flags, str(source), "-o", str(program)], check=True, capture_output=True, text=True)
     printed = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
     assert {name: int(value) for name, value in (line.split() for line in printed.splitlines())} == wanted

@@ -233,6 +233,8 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
 
     import typer.main
 
+    from tests.support.peak_memory import peak_mb, reset_peak
+
     typer.main.get_command = functools.cache(
         typer.main.get_command
     )  # making it anew takes four times what a case does
@@ -250,8 +252,7 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
     for number in range(first, last):
         one = case(number, only)
         print(json.dumps({"at": number, "command": one.command.name}), flush=True)
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is what it is now
-        began_mb = _memory_mb("VmRSS")
+        began_mb = reset_peak()
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
         signal.alarm(CASE_S)
         try:
@@ -268,19 +269,13 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
                 raise
         finally:
             signal.alarm(0)
-        peak_mb = _memory_mb("VmHWM") - began_mb
-        if peak_mb * 1e6 > MEMORY_BYTES and not wrong:
-            wrong = f"it took {peak_mb:.0f} MB"
+        taken_mb = peak_mb() - began_mb
+        if taken_mb * 1e6 > MEMORY_BYTES and not wrong:
+            wrong = f"it took {taken_mb:.0f} MB"
         took_s = time.perf_counter() - began_s
         cpu_s = time.process_time() - began_cpu_s
-        done = {"done": number, "wrong": wrong, "took_s": round(took_s, 3), "cpu_s": cpu_s, "peak_mb": peak_mb}
+        done = {"done": number, "wrong": wrong, "took_s": round(took_s, 3), "cpu_s": cpu_s, "peak_mb": taken_mb}
         print(json.dumps(done), flush=True)
-
-
-def _memory_mb(what: str) -> float:
-    """A figure of the kernel for this process."""
-    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(f"{what}:"))
-    return float(line.split()[1]) / 1e3
 
 
 Outcome = tuple[Counter[str], list[tuple[int, str, str]], float]

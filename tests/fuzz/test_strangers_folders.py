@@ -7,7 +7,6 @@ import io
 import json
 import os
 import re
-import resource
 import shutil
 import struct
 import tomllib
@@ -33,6 +32,7 @@ from membrane_ctrl.run_files.inputs_file import decode_columns, open_inputs
 from membrane_ctrl.run_files.sealed_stream import SealedStream, require_bounded, unseal
 from membrane_ctrl.run_files.segments import panics_are_faults, whole_messages
 from membrane_ctrl.run_files.tables import tick_schema
+from tests.support.peak_memory import peak_mb, reset_peak
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
 FRAME = struct.Struct("<8sII")
@@ -187,10 +187,6 @@ def test_inputs_that_are_a_pipe_are_one_line(earlier: Path, capsys: Said) -> Non
 # ---------------------------------------------------------------------------------------------------------- bounds
 
 
-def peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_four_megabytes_of_a_table_that_would_be_four_gigabytes(folder: Path, capsys: Said) -> None:
     path = folder / "columns" / "ticks-000.arrows"
@@ -201,10 +197,10 @@ def test_four_megabytes_of_a_table_that_would_be_four_gigabytes(folder: Path, ca
     stream.write(pa.record_batch(arrays, schema=schema))
     stream.close()
     assert path.stat().st_size < 1e6
-    before = peak_mb()
+    before_mb = reset_peak()
     assert run(["report", str(folder), "--json"]) == 0
     assert re.search(r"ticks-000.arrows: cannot be read \(a batch of \d+ MB", capsys.readouterr().out)
-    assert peak_mb() - before < 300
+    assert peak_mb() - before_mb < 300
 
 
 def test_a_batch_that_lies_about_its_size_is_refused_unread() -> None:
@@ -275,9 +271,9 @@ def test_a_second_of_inputs_that_would_be_four_gigabytes(earlier: Path, capsys: 
     bomb = zlib.compressobj(9)
     packed = b"".join(bomb.compress(bytes(10**7)) for _ in range(40)) + bomb.flush()
     path.write_bytes(head + FRAME.pack(b"MBRNin01", len(packed), zlib.crc32(packed)) + packed)
-    before = peak_mb()
+    before_mb = reset_peak()
     assert "no tick to replay" in refused(capsys, "replay", str(earlier))
-    assert peak_mb() - before < 200
+    assert peak_mb() - before_mb < 200
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**20, 51])
@@ -392,9 +388,9 @@ def test_json_that_would_take_all_there_is(folder: Path, text: str, why: str, ca
     (folder / "summary.json").write_text(text)
     with (folder / "events.jsonl").open("a") as file:
         file.write(text + ("\n{}{}\n" if why.startswith("events.jsonl: 1") else "\n"))
-    before = peak_mb()
+    before_mb = reset_peak()
     assert run(["runs", "show", str(folder)]) == 0
-    assert peak_mb() - before < 500
+    assert peak_mb() - before_mb < 500
     assert why in capsys.readouterr().out
 
 
@@ -405,11 +401,11 @@ def test_a_picture_of_twenty_thousand_by_twenty_thousand(sets: Path, capsys: Sai
     struct.pack_into(">II", data, 16, 20_000, 20_000)
     struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))
     path.write_bytes(data)
-    before = peak_mb()
+    before_mb = reset_peak()
     assert run(["measure", str(folder), "--json"]) == 3
     reason = json.loads(capsys.readouterr().out)["quality"]["reason"]
     assert "20000 x 20000 pixels exceed the limit of 64 million" in reason
-    assert peak_mb() - before < 200
+    assert peak_mb() - before_mb < 200
 
 
 @pytest.mark.parametrize("suffix", [".tiff", ".bmp", ".jpg"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import configparser
 import math
-import shutil
 import socket
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import SystemdNotify
 from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
+from tests.support.machine_needs import needs
 
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
 UNIT = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
@@ -107,7 +107,7 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
     assert float(service["WatchdogSec"]) >= 5.0
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze on this machine")
+@needs("systemd-analyze")
 def test_the_unit_file_is_one_that_systemd_takes_and_calls_protected(tmp_path: Path) -> None:
     example = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
     unit = tmp_path / example.name

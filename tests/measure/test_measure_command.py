@@ -330,14 +330,12 @@ FACET = Path(__file__).parents[2].parent / "shared" / "data" / "sofast" / "measu
 
 @pytest.mark.skipif(not FACET.is_file(), reason="no measured facet")
 def test_frames_of_a_measured_facet(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("h5py")
     assert run(["measure", str(FACET), "--json"]) == 0
     table = json.loads(capsys.readouterr().out)
     assert table["quality"] == {"verdict": "ok", "reason": "", "flagged_frames": []}
 
 
 def test_what_is_no_facet_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("h5py")
     (tmp_path / "x.h5").write_text("no")
     for name in ("x.h5", "none.h5"):
         assert run(["measure", str(tmp_path / name)]) == 2

@@ -3,13 +3,12 @@
 import os
 import sys
 
+import h5py
 import numpy as np
 import pytest
 
 from membrane_ctrl.measure import measure as sofast
 from tests.support import sofast_facet
-
-h5py = pytest.importorskip("h5py")
 
 
 def write(path, **items):

@@ -14,15 +14,10 @@ from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams, send_events
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.review.viewer.viewer import screenshot
+from tests.support.machine_needs import needs
 from tests.support.synthetic_run import rows_of, shape_of
 
-pytestmark = [
-    pytest.mark.viewer,
-    pytest.mark.skipif(
-        not list(Path("/usr/share/vulkan/icd.d").glob("*.json")),
-        reason="no Vulkan driver: apt-get install mesa-vulkan-drivers libvulkan1",
-    ),
-]
+pytestmark = [pytest.mark.viewer, needs("vulkan")]
 
 # Colours of the plots as the viewer draws them (red, green, blue).
 ERROR_BLUE = (86, 180, 233)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -13,14 +12,10 @@ import pytest
 from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.review.viewer.blueprints import TABS
+from tests.support.machine_needs import needs, program_path
 from tests.support.review_runs import written
 
 ERROR_BLUE = (86, 180, 233)
-needs_vulkan = pytest.mark.skipif(
-    not list(Path("/usr/share/vulkan/icd.d").glob("*.json")),
-    reason="no Vulkan driver: apt-get install mesa-vulkan-drivers libvulkan1",
-)
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +31,7 @@ def share_near(picture: Path, colour: tuple[int, int, int]) -> float:
 
 
 @pytest.mark.viewer
-@needs_vulkan
+@needs("vulkan")
 @pytest.mark.parametrize(
     "tab", ["overview", *(pytest.param(tab, marks=pytest.mark.campaign) for tab in TABS if tab != "overview")]
 )
@@ -47,7 +42,7 @@ def test_a_tab_shows_its_plots(run_dir: Path, tmp_path: Path, tab: str) -> None:
 
 
 @pytest.mark.viewer
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+@needs("chromium")
 def test_the_report_is_drawn_by_a_browser(run_dir: Path, tmp_path: Path) -> None:
     assert command(["report", str(run_dir), "--out", str(tmp_path)]) == 0
     picture = tmp_path / "report.png"
@@ -57,6 +52,6 @@ def test_the_report_is_drawn_by_a_browser(run_dir: Path, tmp_path: Path) -> None
         f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}",
     ]  # fmt: skip
     page = (tmp_path / "report.html").as_uri()
-    subprocess.run([str(CHROMIUM), *options, page], check=True, capture_output=True, timeout=60)
+    subprocess.run([program_path("chromium"), *options, page], check=True, capture_output=True, timeout=60)
     assert share_near(picture, (0, 158, 115)) > 0.005  # the lane of hold
     assert share_near(picture, (0, 114, 178)) > 0.003  # the blue of every plot

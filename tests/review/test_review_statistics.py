@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import allantools
 import numpy as np
 import pytest
 from scipy import signal
@@ -10,7 +11,6 @@ from membrane_ctrl.review.statistics.analysis import slow_spectrum
 from membrane_ctrl.review.statistics.drift import slope
 from membrane_ctrl.review.statistics.spectra import Spectrum, allan_deviation, bands, power_spectrum, unseen_s
 
-allantools = pytest.importorskip("allantools", reason="the reference for the Allan deviation is not installed")
 RATE_HZ = 10.0
 
 

@@ -6,7 +6,6 @@ import asyncio
 import base64
 import itertools
 import json
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,7 +15,8 @@ from urllib.parse import quote
 from tornado.httpclient import AsyncHTTPClient
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+from tests.support.machine_needs import program_path
+
 _PATIENCE_S = 180.0  # a page that hangs; with a thirtieth of a core, steps have taken more than 60
 _LOOK_S = 0.1
 _FIND = """function find(root, label) {
@@ -95,9 +95,8 @@ async def browser_tab(
     url: str, folder: Path, width: int = 1500, height: int = 1000, *flags: str
 ) -> AsyncIterator[Tab]:
     """A tab of a new Chromium on a page; `folder` takes its profile."""
-    assert CHROMIUM is not None
     process = await asyncio.create_subprocess_exec(
-        CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
+        program_path("chromium"), "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
         f"--window-size={width},{height}", f"--user-data-dir={folder}", *flags, "about:blank",
         stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
     )  # fmt: skip

@@ -8,18 +8,23 @@ while it runs: packets are lost, it is unplugged and plugged in again.
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import socket
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from ctypes import c_size_t, c_uint32, c_void_p
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from firmware_iface.links.aravis import PIXEL_FORMATS, aravis
 from firmware_iface.roles import LinkError
+from tests.support.machine_needs import require
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -28,6 +33,7 @@ _SENSOR_WIDTH, _SENSOR_HEIGHT, _WIDTH, _HEIGHT = 0x11C, 0x118, 0x100, 0x104
 # How often the library's thread checks for a trigger; its own 25 Hz would delay each frame by 40 ms
 _TRIGGER_LOOKS_HZ = 500.0
 _GVCP_PORT = 3956  # GigE Vision control, fixed by the standard
+_PORT_LOCK = Path(tempfile.gettempdir()) / f"membrane-tests-port-{_GVCP_PORT}.lock"
 _FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
 _XML_FORMAT = '<EnumEntry Name="{name}" NameSpace="Standard"><Value>{value}</Value></EnumEntry>'
 _XML_LAST_FORMAT = '<EnumEntry Name="Mono16" NameSpace="Standard">'
@@ -144,6 +150,28 @@ class GigeCameraEmulator:
             self.error = error
             ctypes.memset(start, 0, size_bytes)
         time.sleep(max(0.0, over_s - time.monotonic()))  # a frame is sent when its exposure is over
+
+
+@contextmanager
+def gige_camera(
+    expose: Callable[[float, int], Pixels], width_px: int, height_px: int
+) -> Iterator[GigeCameraEmulator]:
+    """A camera that is plugged in, for a test; waits until other tests of this machine have unplugged theirs.
+
+    The test is skipped where the library is missing, or where another program has the standard's one port.
+    """
+    require("aravis")
+    with _PORT_LOCK.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        emulator = GigeCameraEmulator(expose, width_px, height_px)
+        try:
+            emulator.plug_in()
+        except LinkError as error:
+            pytest.skip(str(error))
+        try:
+            yield emulator
+        finally:
+            emulator.unplug()
 
 
 def _description() -> str:

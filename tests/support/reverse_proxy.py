@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-NGINX = shutil.which("nginx") or ("/usr/sbin/nginx" if Path("/usr/sbin/nginx").exists() else None)
+from tests.support.machine_needs import program_path
+
 _START_S = 30.0
 _CONFIGURATION = """daemon off;
 worker_processes 1;
@@ -42,13 +42,12 @@ async def reverse_proxy(
     folder: Path, port: int, location: str, target: str, headers: str = ""
 ) -> AsyncIterator[None]:
     """An nginx that passes what is under `location` on to `target`; other paths get 404."""
-    assert NGINX is not None
     rest = "" if location == "/" else "location / { return 404; }"
     text = _CONFIGURATION.format(
         folder=folder, port=port, location=location, target=target, headers=headers, rest=rest
     )
     file = _write_configuration(folder, text)
-    words = [NGINX, "-p", str(folder), "-e", str(folder / "nginx-errors.txt"), "-c", str(file)]
+    words = [program_path("nginx"), "-p", str(folder), "-e", str(folder / "nginx-errors.txt"), "-c", str(file)]
     process = await asyncio.create_subprocess_exec(*words)
     try:
         async with asyncio.timeout(_START_S):

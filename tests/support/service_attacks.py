@@ -86,21 +86,19 @@ async def status_of(url: str, raw: bytes, wait_s: float = 20.0) -> int:
 
 
 async def _flood_logins(url: str, number: int) -> None:
-    """Post wrong passwords for a name of its own without a pause, on one connection as long as it lives."""
-    form = f"name=x{number}&password=yyyyyyyy".encode()
-    raw = request_bytes(url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded")
-    reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        while True:
-            writer.write(raw)
-            await writer.drain()
-            await _read_answer(reader)
+    """Post wrong passwords for a name that no other client uses."""
+    await _repeat_login(url, f"x{number}", "yyyyyyyy")
 
 
 async def _flood_owner(url: str, number: int) -> None:
-    """Post wrong passwords for the owner's name without a pause."""
-    form = f"name=anna&password=guess{number:04}".encode()
-    raw = request_bytes(url, ROUTES.login, "POST", form)
+    """Post wrong passwords for the owner's name."""
+    await _repeat_login(url, "anna", f"guess{number:04}")
+
+
+async def _repeat_login(url: str, name: str, password: str) -> None:
+    """Post a login without a pause, on one connection as long as it lives."""
+    form = f"name={name}&password={password}".encode()
+    raw = request_bytes(url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded")
     reader, writer = await connect(url)
     with contextlib.closing(writer):
         while True:
@@ -131,10 +129,7 @@ async def _drip_head(url: str, number: int) -> None:
     _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, "")[:-2] + b"X-Padding: ")
-        while True:
-            writer.write(b"x")
-            await writer.drain()
-            await asyncio.sleep(1.0)
+        await _send_forever(writer, b"x", pause_s=1.0)
 
 
 async def _drip_body(url: str, number: int) -> None:
@@ -142,10 +137,7 @@ async def _drip_body(url: str, number: int) -> None:
     _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, ROUTES.login, "POST", b"n" * 3000)[:-3000])
-        while True:
-            writer.write(b"n")
-            await writer.drain()
-            await asyncio.sleep(1.0)
+        await _send_forever(writer, b"n", pause_s=1.0)
 
 
 async def _send_large_heads(url: str, number: int) -> None:
@@ -153,9 +145,7 @@ async def _send_large_heads(url: str, number: int) -> None:
     _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(request_bytes(url, "")[:-2])
-        while True:
-            writer.write(b"X-Padding: " + b"x" * 8000 + b"\r\n")
-            await writer.drain()
+        await _send_forever(writer, b"X-Padding: " + b"x" * 8000 + b"\r\n")
 
 
 async def _send_large_bodies(url: str, number: int) -> None:
@@ -165,9 +155,15 @@ async def _send_large_bodies(url: str, number: int) -> None:
     _reader, writer = await connect(url)
     with contextlib.closing(writer):
         writer.write(head)
-        while True:
-            writer.write(b"x" * 65_536)
-            await writer.drain()
+        await _send_forever(writer, b"x" * 65_536)
+
+
+async def _send_forever(writer: asyncio.StreamWriter, data: bytes, pause_s: float = 0.0) -> None:
+    """Send the same bytes until the connection is closed, as fast as they are received but for the pause."""
+    while True:
+        writer.write(data)
+        await writer.drain()
+        await asyncio.sleep(pause_s)
 
 
 ATTACKS: dict[str, Callable[[str, int], Awaitable[None]]] = {

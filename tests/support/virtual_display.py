@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import struct
 import subprocess
 from collections.abc import Iterator
@@ -11,16 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
+
+from tests.support.machine_needs import require
 
 
 @contextmanager
 def virtual_display(folder: Path, width_px: int, height_px: int) -> Iterator[Path]:
     """Xvfb with a framebuffer file below `folder`; DISPLAY points to it meanwhile."""
-    if shutil.which("Xvfb") is None:
-        pytest.skip("Xvfb is not installed: apt install xvfb")
-    pytest.importorskip("pygame", reason="pip install 'membrane-ctrl[screen]'")
+    require("Xvfb")
     number_end, server_end = os.pipe()
     command = ["Xvfb", "-displayfd", str(server_end), "-screen", "0", f"{width_px}x{height_px}x24"]
     # without -noreset it resets when its last client leaves, and the next may come too early

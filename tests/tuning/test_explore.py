@@ -25,7 +25,8 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import review_runs
-from tests.support.browser import CHROMIUM, browser_tab
+from tests.support.browser import browser_tab
+from tests.support.machine_needs import needs
 from tuning import gains_file, session
 from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
 from tuning.explore.page import saver
@@ -242,7 +243,7 @@ _MOVE = "Bokeh.documents[0].get_model_by_name('{}').value = {}"
 
 
 @pytest.mark.real_time
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
+@needs("chromium")
 async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     command = (sys.executable, "-m", "membrane_ctrl", "tune", "explore", str(opened.path))

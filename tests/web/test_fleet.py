@@ -19,7 +19,8 @@ from membrane_ctrl.web.feed import HoldFeed
 from membrane_ctrl.web.panels import fleet_rows
 from tests.control_port.port_run import port_run
 from tests.support.browser import browser_tab
-from tests.web.test_page import needs_browser, served, ticking
+from tests.support.machine_needs import needs
+from tests.web.test_page import served, ticking
 
 
 def fleet_file(folder: Path, *names: str) -> Path:
@@ -98,7 +99,7 @@ def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
     ]
 
 
-@needs_browser
+@needs("chromium")
 @pytest.mark.campaign
 @pytest.mark.real_time
 async def test_twenty_holds_on_one_page(tmp_path: Path) -> None:

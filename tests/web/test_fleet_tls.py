@@ -6,7 +6,6 @@ import asyncio
 import base64
 import hashlib
 import json
-import shutil
 import socket
 import subprocess
 from contextlib import AsyncExitStack
@@ -21,9 +20,9 @@ from membrane_ctrl.web import cli, server
 from tests.control_port.port_certificates import Authority, tls_fleet
 from tests.control_port.port_run import port_run
 from tests.support.browser import Tab, browser_tab
-from tests.web.test_page import free_port, needs_browser, served, ticking
+from tests.support.machine_needs import needs
+from tests.web.test_page import free_port, served, ticking
 
-needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")
 PASSWORD = "membrane!"
 ROWS = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('{}'))"
@@ -80,8 +79,8 @@ def pair(folder: Path) -> tuple[str, ...]:
     return ("--certificate", str(folder / "page.pem"), "--key", str(folder / "page.key"))
 
 
-@needs_browser
-@needs_openssl
+@needs("chromium")
+@needs("openssl")
 @pytest.mark.campaign
 @pytest.mark.real_time
 async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
@@ -136,7 +135,7 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         assert [len(run.asked) for run in runs] == [1, 0]
 
 
-@needs_openssl
+@needs("openssl")
 @pytest.mark.parametrize(
     ("certificate", "key", "says"),
     [

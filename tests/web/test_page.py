@@ -25,7 +25,8 @@ from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.web import cli, panels, server
 from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
-from tests.support.browser import CHROMIUM, Tab, browser_tab
+from tests.support.browser import Tab, browser_tab
+from tests.support.machine_needs import needs
 
 _START_S = 180.0
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
@@ -76,10 +77,7 @@ async def viewed(tmp_path: Path, *options: str) -> AsyncIterator[tuple[PortRun, 
             task.cancel()
 
 
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install chromium")
-
-
-@needs_browser
+@needs("chromium")
 @pytest.mark.real_time
 async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
     async with viewed(tmp_path) as (run, tab):
@@ -98,7 +96,7 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         await tab.screenshot(tmp_path / "page.png")
 
 
-@needs_browser
+@needs("chromium")
 @pytest.mark.real_time
 async def test_a_viewer_sees_all_locks_and_types_the_word_of_one(tmp_path: Path) -> None:
     press = "[...document.querySelectorAll('button')].find(b => b.innerText.trim().toLowerCase() === '{}').click()"
@@ -138,7 +136,7 @@ CONTRAST = """(element => {
   return (high + 0.05) / (low + 0.05) })"""
 
 
-@needs_browser
+@needs("chromium")
 @pytest.mark.real_time
 @pytest.mark.campaign
 async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
@@ -201,7 +199,7 @@ CANDIDATES = """| candidate | K 1/s | std um | Ms | against present |
 PRESS = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.toUpperCase().includes('{}')).click()"
 
 
-@needs_browser
+@needs("chromium")
 @pytest.mark.real_time
 @pytest.mark.campaign
 async def test_a_candidate_is_chosen_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,15 +13,13 @@ import pytest
 
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import browser_tab
-from tests.support.reverse_proxy import NGINX, reverse_proxy
+from tests.support.machine_needs import needs
+from tests.support.reverse_proxy import reverse_proxy
 from tests.support.service_attacks import ROUTES, Viewer, attack, request_bytes, status_of
-from tests.web.test_page import STOP, free_port, needs_browser, served, ticking
+from tests.web.test_page import STOP, free_port, served, ticking
 from tests.web.test_page_under_attack import PASSWORD, serving
 
-pytestmark = [
-    pytest.mark.real_time,
-    pytest.mark.skipif(NGINX is None, reason="no nginx: apt-get install nginx-light"),
-]
+pytestmark = [pytest.mark.real_time, needs("nginx")]
 OWN_HOST = "proxy_set_header Host $http_host;"
 PREFIX = "proxy_set_header X-Forwarded-Prefix /mirror;"
 CLIENT = "proxy_set_header X-Forwarded-For $proxy_add_x_forwarded_for;"
@@ -140,7 +138,7 @@ async def test_a_flood_through_the_proxy_delays_no_viewer(tmp_path: Path) -> Non
         assert len(run.asked) == 8
 
 
-@needs_browser
+@needs("chromium")
 async def test_a_browser_operates_the_hold_under_a_path(tmp_path: Path) -> None:
     outside, inside = free_port(), free_port()
     public = f"http://127.0.0.1:{outside}/mirror/"
