@@ -13,6 +13,7 @@ from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model import clock, events, run_events, telemetry
+from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child, Program, pipe
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
 
@@ -123,7 +124,7 @@ class ManagedChild:
 
 _TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
 _EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
-_SHAPES_KEPT, _SHAPE_BYTES = 64, 1 << 16  # a 36 x 36 covariance is 10 kB
+_SHAPES_KEPT = 64
 _RECORDER_CLOSES_S = 30.0
 _CHILD_STOPS_S = 3.0
 _ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
@@ -150,7 +151,7 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
     camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
     if not camera or not config.shape.enabled:
         return Rings(rows, events, inputs, None, None, truth)
-    shapes = stack.enter_context(ring(_SHAPES_KEPT, _SHAPE_BYTES))
+    shapes = stack.enter_context(ring(_SHAPES_KEPT, ESTIMATE_BYTES_MAX))
     return Rings(rows, events, inputs, shapes, _frames(config, stack), truth)
 
 

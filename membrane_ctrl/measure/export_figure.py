@@ -19,6 +19,7 @@ from membrane_ctrl.metrology.figure import LEAST_CELLS
 from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 _REMOVABLE = {"piston": (0,), "tilt": (1, 2), "power": (3,)}  # places in the Fringe set
 _CELLS_MAX = 4_000_000
@@ -153,9 +154,9 @@ def _zernike_table(index: str, seen: ExportedMap, table: dict[str, Any], where: 
             coeffs, radius = np.array(own.get("coeffs_um"), float), float(own.get("radius_mm", math.nan))
         except (TypeError, ValueError):
             coeffs, radius = np.zeros(0), math.nan
-        if coeffs.shape != (zernike.TERMS,) or not (np.isfinite(coeffs).all() and radius > 0):
-            raise errors.InputError(f"{where / 'result.json'}: zernike: needs {zernike.TERMS} coefficients, a radius")
-        orders, first, normalisation = [zernike.noll(j + 1) for j in range(zernike.TERMS)], 1, "rms"
+        if coeffs.shape != (ZERNIKE_TERMS,) or not (np.isfinite(coeffs).all() and radius > 0):
+            raise errors.InputError(f"{where / 'result.json'}: zernike: needs {ZERNIKE_TERMS} coefficients, a radius")
+        orders, first, normalisation = [zernike.noll(j + 1) for j in range(ZERNIKE_TERMS)], 1, "rms"
         if index == "osa":
             coeffs, orders, first = zernike.osa_from_noll(coeffs), sorted(orders), 0
     return {

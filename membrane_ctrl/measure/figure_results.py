@@ -28,6 +28,7 @@ from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
 from membrane_ctrl.model.terminal import plain
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 ENERGY_SHARES = np.linspace(0.01, 1.0, 100)
 
@@ -115,7 +116,7 @@ def _zernike_tables(measurement: Measurement, found: MeasuredFigure, bars: Error
     """The height in three sets of terms; Noll's and OSA's are the same terms, Fringe's are fitted to the map."""
     radius_mm = measurement.head.optics.mirror.radius_mm
     to_coeffs = surface.parameter_to_coeffs()
-    coeffs = 1e3 * measurement.full.surface.coeffs_mm if measurement.full else np.full(zernike.TERMS, np.nan)
+    coeffs = 1e3 * measurement.full.surface.coeffs_mm if measurement.full else np.full(ZERNIKE_TERMS, np.nan)
     of_noise, of_geometry = (
         1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ c @ to_coeffs.T), 0.0)) for c in (bars.noise, bars.geometry)
     )

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.optics import geometry, surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 
 if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
     import rerun as rr
@@ -271,7 +272,7 @@ def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Pat
         recording.log("measure/verdict", rr.TextDocument("\n".join(words)), static=True)
         if full is not None:
             coeffs_um = 1e3 * full.surface.coeffs_mm
-            recording.log("measure/zernike_um", rr.BarChart(coeffs_um[1:], abscissa=np.arange(2, 37)), static=True)
+            recording.log("measure/zernike_um", rr.BarChart(coeffs_um[1:], abscissa=NOLL_INDICES[1:]), static=True)
             # row 0 of a picture is at the top, i.e. at +y
             height = full.height_mm()[::-1].astype(np.float32)
             residual = (1e3 * full.residual_mm)[::-1].astype(np.float32)

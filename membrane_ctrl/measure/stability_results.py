@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.pictures import log_pictures, result_recording, show_map
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import zernike_columns, zernike_labels
 
 _HEAD = ("set", "verdict", "reason")
 _NUMBERS = ("time_s", "displacement_um", "sag_um", "slope_residual_urad", "rmse_mean_um")
-_ZERNIKE = tuple(f"z{j}_um" for j in range(1, 37))
+_ZERNIKE = tuple(zernike_columns())
 
 
 def series_head(points: Iterable[str]) -> tuple[str, ...]:
@@ -119,7 +120,7 @@ def log_stability(
     sd_um : (m, m) array
         Map of standard deviations, rows along y, NaN outside.
     """
-    terms = [f"Z{j}" for j in range(2, 37)]
+    terms = zernike_labels(first=2)
     with result_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:
         recording.log("stability/report", rr.TextDocument("\n".join(lines)), static=True)
         # row 0 of a picture is at the top, i.e. at +y

@@ -27,6 +27,7 @@ from membrane_ctrl.metrology.track.tracked import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
+from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_labels
 
 _SAME_REGION = 1e-4  # of its side: rounding of written decimals
 _NAMED = 5  # reasons shown
@@ -259,7 +260,7 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
         at = [rr.TimeColumn("run_time", duration=time_s)]
         recording.send_columns("track/sag_um", at, rr.Measurements.columns(values=sag_um, variances=sigma_um**2))
         if change_um is not None:
-            names = [f"Z{j}" for j in range(2, 37)]
+            names = zernike_labels(first=2)
             recording.log("track/terms_um", rr.SeriesLines(names=names), static=True)
             recording.send_columns("track/terms_um", at, rr.Scalars.columns(scalars=change_um[:, 1:]))
         states = [f"{frame.verdict} {frame.reason}".strip() for frame in track.frames]
@@ -278,9 +279,9 @@ def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, res
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
     time_s, sag_um, sigma_um = (columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um"))
     if change_um is not None:
-        shown = change_um[::every, 3:].T
+        shown = change_um[::every, FIRST_FIGURE_INDEX - 1 :].T
         most = float(np.nanquantile(np.abs(shown), 0.995)) or 1.0
-        extent = (time_s[0], time_s[-1] + 1e-9, 36.5, 3.5)
+        extent = (time_s[0], time_s[-1] + 1e-9, ZERNIKE_TERMS + 0.5, FIRST_FIGURE_INDEX - 0.5)
         style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -most, "vmax": most, "interpolation": "nearest"}
         bar = terms.imshow(shown, aspect="auto", extent=extent, **style)
         figure.colorbar(bar, ax=terms)

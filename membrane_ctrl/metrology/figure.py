@@ -16,7 +16,7 @@ from membrane_ctrl.metrology.optics import surface, zernike
 from membrane_ctrl.model.arrays import FloatArray
 
 _FRINGE = [zernike.fringe(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
-_PVR_TERMS = 36
+_PVR_TERMS = 36  # by definition, whatever the fit's own number
 LEAST_CELLS = 4 * zernike.FRINGE_TERMS  # fewer give no figure
 _RINGS = 96  # knots of the rotationally invariant part: 5 mm on a 1 m mirror
 _SHARES = (0.5, 0.8, 0.95)  # of the encircled energy

@@ -18,14 +18,15 @@ from numpy.polynomial import legendre, polynomial
 
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.film_law import Bowl, FilmLaw, HarmonicCause
-from membrane_ctrl.metrology.optics.zernike import TERMS
+from membrane_ctrl.metrology.optics.surface import PARAMETERS
 from membrane_ctrl.model.arrays import FloatArray, IntArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 # What is known without the sets: films are stretched by some 0.1 %, and a polymer's Poisson ratio is 0.25 to 0.45
 PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
 _RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "round": 2.0}  # mm
-_ROUND = np.array([2, 9, 20, 35])  # of a figure's 36 parameters: Noll 4, 11, 22, excess
-_FREEDOM = np.array([1.0, 1.0, 1.0, 0.1])  # of a misfit: the excess has a tenth of a term's
+_ROUND = np.array([*(j - 2 for j in film_law.ROUND_NOLL[1:]), PARAMETERS - 1])  # places among a figure's parameters
+_FREEDOM = np.append(np.ones(_ROUND.size - 1), 0.1)  # of a misfit: the excess has a tenth of a term's
 # Of the misfit that differs between the sets: what does not follow the sag, and what does but is another figure
 _DIFFERS, _UNRELATED = 0.1, 0.5
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
@@ -104,7 +105,7 @@ def fit_film(figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float
     bowls = law.loaded(np.exp(unknowns[3:, None]))
     waves, predicted = _fit_ring(figures, bowls, reach, seen_mm)
     predicted[:, _ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
-    known = np.zeros(TERMS, bool)
+    known = np.zeros(ZERNIKE_TERMS, bool)
     known[_ROUND] = True
     for order in (1, 2, 3):
         known[_terms(order).ravel()] = True
@@ -114,7 +115,7 @@ def fit_film(figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float
 
 def _seen_mm(figures: Sequence[FilmFigure]) -> float:
     """Size of a term that no law of this module has, from those with azimuthal orders of 4 and more."""
-    others = np.concatenate([_terms(order).ravel() for order in (4, 5, 6, 7)])
+    others = np.concatenate([_terms(order).ravel() for order in range(4, ZERNIKE_DEGREE + 1)])
     squares = [each.parameters_mm[others] ** 2 - np.diag(each.noise_mm2)[others] for each in figures]
     return float(np.sqrt(max(np.mean(squares), _LEAST_MM**2)))
 
@@ -137,7 +138,8 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     """Radii, weights, and the least squares of slopes there onto the four terms."""
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
-    slopes = [np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(np.eye(4)[k])) for k in (1, 2, 3)]
+    round_degrees = [*enumerate(np.eye(film_law.EXCESS_DEGREE))][1:]
+    slopes = [np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(unit)) for k, unit in round_degrees]
     excess = 2 * rho * polynomial.polyval(rho**2, polynomial.polyder(film_law.excess())) / film_law.excess_rms()
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
 
@@ -289,7 +291,7 @@ def _terms(order: int) -> IntArray:
     """Places among the parameters of the cosine and the sine terms of an azimuthal order, without tilt, (2, 3)."""
     found: dict[int, list[int]] = {0: [], 1: []}
     j = 1
-    for n in range(8):
+    for n in range(ZERNIKE_DEGREE + 1):
         for place in range(n + 1):
             m = n % 2 + 2 * ((place + (n + 1) % 2) // 2)
             if m == order and n > 1:
@@ -302,7 +304,7 @@ def _fit_ring(
     figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm: float
 ) -> tuple[tuple[RingWave, ...], FloatArray]:
     """Waves of the ring, and what they add to the figures' parameters (n, 36)."""
-    added = np.zeros((len(figures), TERMS))
+    added = np.zeros((len(figures), ZERNIKE_TERMS))
     waves = []
     alike = _alike(figures)
     for order in (1, 2, 3):
@@ -338,10 +340,10 @@ def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) 
         return np.concatenate([along * weight, order * rho ** (order - 1) * value * weight])
 
     terms = []
-    for n in range(order, 8, 2):
+    for n in range(order, ZERNIKE_DEGREE + 1, 2):
         # R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v - 1), here by Legendre's least squares (exact)
         jacobi = eval_jacobi((n - order) // 2, 0, order, 2 * rho**2 - 1)
-        radial = legendre.Legendre.fit(rho**2, jacobi, 4, domain=[0, 1])
+        radial = legendre.Legendre.fit(rho**2, jacobi, ZERNIKE_DEGREE // 2, domain=[0, 1])
         terms.append(np.sqrt(2 * (n + 1)) * slopes(radial))
     onto = np.linalg.pinv(np.stack(terms).T)
     loads = zip(bowls.slackness.ravel(), bowls.load.ravel(), strict=True)

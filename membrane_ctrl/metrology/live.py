@@ -15,10 +15,11 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, motion, phase, phasor, reconstruct
 from membrane_ctrl.metrology.frames import bands
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack
-from membrane_ctrl.metrology.optics import film_law, geometry, surface, zernike
+from membrane_ctrl.metrology.optics import film_law, geometry, surface
 from membrane_ctrl.metrology.uncertainty import geometry_spread, live_errors
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of half a period, so
 # that a field which passes half a period anywhere shows points in the band before it.
@@ -319,9 +320,9 @@ def rejected(
     return ShapeEstimate(
         time_s=_finite_mean(times),
         kind=kind,
-        coeffs_um=np.full(zernike.TERMS, nan),
+        coeffs_um=np.full(ZERNIKE_TERMS, nan),
         hencky_um=nan,
-        covariance_um2=np.full((zernike.TERMS, zernike.TERMS), nan),
+        covariance_um2=np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), nan),
         sag_um=nan,
         sag_sigma_um=nan,
         displacement_um=_finite_mean(readings),

@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.optics import compiled, film_law, kernels, zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 # Normal equations of the slope fit, made from moments (the paper's eqs. for D, G and A).
 #
@@ -27,7 +28,7 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 # the Hencky excess replaces piston's column, scaled to unit RMS like the others.
 
 _M = kernels.SLOPE_MONOMIALS
-_POWERS = [(p, q) for p in range(zernike.DEGREE) for q in range(zernike.DEGREE - p)]  # in the kernels' order
+_POWERS = [(p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)]  # in the kernels' order
 _PRODUCT_POWERS = [(p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in range(kernels.PRODUCT_DEGREE + 1 - p)]
 
 

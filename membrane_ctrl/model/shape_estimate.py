@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 
 Kind = Literal["full", "fringes", "track"]
 Verdict = Literal["ok", "degraded", "rejected"]
-TERMS = 36
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +59,10 @@ _ARRAYS = ("coeffs_um", "covariance_um2")
 _OTHERS = {"reason", "cycle", "tracking_lost"}
 NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
 _KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms", "symmetric", "single"}
-_UPPER = np.triu_indices(TERMS)
-UPPER_TERMS = _UPPER[0].size
+_UPPER = np.triu_indices(ZERNIKE_TERMS)
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
-_COEFFS_BYTES = 8 * TERMS
+_COEFFS_BYTES = 8 * ZERNIKE_TERMS
+ESTIMATE_BYTES_MAX = _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE  # of `pack_estimate`
 _LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
 
 
@@ -79,7 +79,7 @@ def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
 
 def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
     """Bytes of an estimate's numbers and words, (36,) coefficients and (666,) upper half."""
-    line = json.dumps({**head, "terms": TERMS, "symmetric": True, "single": True}, default=float)
+    line = json.dumps({**head, "terms": ZERNIKE_TERMS, "symmetric": True, "single": True}, default=float)
     arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
     return line.encode() + b"\n" + arrays
 
@@ -94,19 +94,19 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
     except RecursionError:
         raise ValueError("shape estimate: not one flat JSON object") from None
     symmetric, single = _checked(head)
-    count = _UPPER[0].size if symmetric else TERMS**2
+    count = COVARIANCE_UPPER_SIZE if symmetric else ZERNIKE_TERMS**2
     if len(arrays) != _COEFFS_BYTES + count * (4 if single else 8):
         raise ValueError(f"shape estimate: {len(arrays)} bytes of arrays do not fit its first line")
-    coeffs_um = np.frombuffer(arrays, dtype="<f8", count=TERMS)
+    coeffs_um = np.frombuffer(arrays, dtype="<f8", count=ZERNIKE_TERMS)
     values = np.frombuffer(arrays, dtype="<f4" if single else "<f8", offset=_COEFFS_BYTES)
     if np.isinf(coeffs_um).any() or np.isinf(values).any():
         raise ValueError("shape estimate: infinite coefficient or covariance")
-    covariance = np.empty((TERMS, TERMS))
+    covariance = np.empty((ZERNIKE_TERMS, ZERNIKE_TERMS))
     if symmetric:
         rows, columns = _UPPER
         covariance[rows, columns] = covariance[columns, rows] = values
     else:
-        covariance[:] = values.reshape(TERMS, TERMS)
+        covariance[:] = values.reshape(ZERNIKE_TERMS, ZERNIKE_TERMS)
     return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)
 
 
@@ -116,8 +116,10 @@ def _checked(head: Any) -> tuple[bool, bool]:
     if not isinstance(head, dict) or not set(head) <= _KEYS:
         raise ValueError("shape estimate: unknown fields in the first line")
     layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
-    if layout[0] != TERMS or not all(isinstance(flag, bool) for flag in layout[1:]):
-        raise ValueError(f"shape estimate: not of {TERMS} terms")
+    if layout[0] != ZERNIKE_TERMS:
+        raise ValueError(f"shape estimate of {str(layout[0])[:8]} Zernike terms; this program has {ZERNIKE_TERMS}")
+    if not all(isinstance(flag, bool) for flag in layout[1:]):
+        raise ValueError("shape estimate: the layout of its covariance is not stated")
     for name in NUMBERS:
         value = head.get(name, math.nan)  # fields missing in older versions are NaN
         if type(value) not in (float, int) or abs(value) > _LARGEST:
@@ -143,7 +145,7 @@ MODULATION_DEGRADED_SHARE = 0.06
 # Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no harm.
 SATURATED_REJECTED_FRACTION = 0.20
 SATURATED_DEGRADED_FRACTION = 0.005
-# 36 terms over a disc with a quarter missing are extrapolated there.
+# Terms over a disc with a quarter missing are extrapolated there.
 VALID_REJECTED_FRACTION = 0.5
 VALID_DEGRADED_FRACTION = 0.9
 # Wrinkles and ripple leave a few tens of microradians; a wrong fringe order leaves 8700 locally.

@@ -13,6 +13,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.events import for_people
 from membrane_ctrl.model.telemetry import RunStatus, gains_words
+from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS
 from membrane_ctrl.run_files import shapes, streams
 
 SUMMARY_PATH = "/summary"
@@ -171,7 +172,9 @@ def _shape(config: Config) -> rrb.Vertical:
                   span=(-band_um, band_um), marks=True),
             _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
             rrb.BarChartView(
-                name="Change of Z2..Z36, µm", origin=shapes.BARS_PATH, plot_legend=rrb.PlotLegend(visible=False)
+                name=f"Change of Z2..Z{ZERNIKE_TERMS}, µm",
+                origin=shapes.BARS_PATH,
+                plot_legend=rrb.PlotLegend(visible=False),
             ),
         ),
         rrb.Horizontal(
@@ -181,7 +184,8 @@ def _shape(config: Config) -> rrb.Vertical:
         ),
     ]  # fmt: skip
     if config.shape.mode == "track":
-        fall = "Z4 (top) to Z36, change since hold began; a column a second, now on the right"
+        terms = f"Z{FIRST_FIGURE_INDEX} (top) to Z{ZERNIKE_TERMS}"
+        fall = f"{terms}, change since hold began; a column a second, now on the right"
         heard = _plot("Vibrations heard in each minute, Hz", streams.VIBRATIONS.path)
         rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard))
     if config.recording.thumbnails:

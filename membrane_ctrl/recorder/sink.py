@@ -29,6 +29,7 @@ from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.files import sync_data
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
 from membrane_ctrl.run_files import segments, shapes, streams
 
@@ -107,7 +108,7 @@ class Recording:
             stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
         for block in streams.MARKS:  # the average of the lines in a pixel would be none
             stream.log(block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True)
-        bars = rr.BarChart(np.zeros(35), abscissa=np.arange(2, 37)).as_component_batches()
+        bars = rr.BarChart(np.zeros(ZERNIKE_TERMS - 1), abscissa=NOLL_INDICES[1:]).as_component_batches()
         abscissa = [part for part in bars if part.component_descriptor().component == "BarChart:abscissa"]
         stream.log(shapes.BARS_PATH, abscissa, static=True)
         for lane in LANES:

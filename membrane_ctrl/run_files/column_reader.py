@@ -14,8 +14,8 @@ import pyarrow as pa
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain, read_bytes
-from membrane_ctrl.model.shape_estimate import UPPER_TERMS
 from membrane_ctrl.model.telemetry import TODAY
+from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import column_codec, sealed_stream, tables
 from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
 
@@ -40,7 +40,7 @@ _LOOK_BYTES = 1 << 20  # covers the header and a first batch
 # Columns of `shapes` that are not numbers.
 _WORDS = frozenset({"kind", "verdict", "reason"})
 _PLAIN = {"data": pa.binary(), "tracking_lost": pa.bool_()}
-_LISTS = {"coeffs_um": 36, "covariance_um2": 36 * 36, "upper_um2": UPPER_TERMS}
+_LISTS = {"coeffs_um": ZERNIKE_TERMS, "covariance_um2": ZERNIKE_TERMS**2, "upper_um2": COVARIANCE_UPPER_SIZE}
 # Limit on memory at a time, whatever the file: numbers of eight bytes, and a batch's other content.
 _PART_CELLS = 24_000_000
 _PART_BYTES = 200_000_000

@@ -14,6 +14,7 @@ from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray, Column
+from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ class Shapes:
 
     def columns(self) -> dict[str, Column | NDArray[np.str_]]:
         """Columns of a table with one row per cycle: time, Z1..Z36, sag, quality, verdict."""
-        coeffs = {f"z{j}_um": np.ascontiguousarray(self.coeffs_um[:, j - 1]) for j in range(1, 37)}
+        coeffs = dict(zip(zernike_columns(), np.ascontiguousarray(self.coeffs_um.T), strict=True))
         numbers = {name: getattr(self, name) for name in NUMBERS}
         return {"time_s": self.time_s} | coeffs | numbers | {"verdict": self.verdict}
 
@@ -83,8 +84,8 @@ NUMBERS = (
 
 def height_basis(x: Column, y: Column) -> Column:
     """(37, points): height above the vertex per unit of each parameter."""
-    units = np.eye(37)
-    return np.stack([Surface(unit[:36], unit[36], 1.0).height(x, y) for unit in units])
+    units = np.eye(ZERNIKE_TERMS + 1)
+    return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
 
 
 # Columns read from the recorder's table.
@@ -99,7 +100,7 @@ def from_table(table: pa.Table) -> Shapes:
     coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
     return Shapes(
         **{name: _numbers(table, name) for name in NUMBERS},
-        coeffs_um=np.full((count, 36), np.nan) if coeffs is None else _matrix(coeffs, count),
+        coeffs_um=np.full((count, ZERNIKE_TERMS), np.nan) if coeffs is None else _matrix(coeffs, count),
         verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
         covariance_time_s=time_s[kept],
         covariance_um2=covariances,
@@ -136,10 +137,10 @@ def from_columns(columns: Mapping[str, Column]) -> Shapes:
     numbers = {name: columns.get(name, np.full(count, np.nan)) for name in NUMBERS}
     return Shapes(
         **{**numbers, "hencky_um": np.zeros(count)},
-        coeffs_um=columns.get("coeffs_um", np.empty((0, 36))),
+        coeffs_um=columns.get("coeffs_um", np.empty((0, ZERNIKE_TERMS))),
         verdict=np.array(["ok"] * count),
         covariance_time_s=np.empty(0),
-        covariance_um2=np.empty((0, 36, 36)),
+        covariance_um2=np.empty((0, ZERNIKE_TERMS, ZERNIKE_TERMS)),
     )
 
 
@@ -161,23 +162,23 @@ def _numbers(table: pa.Table, name: str) -> Column:
 
 
 def _matrix(cells: pa.Array, count: int) -> Column:
-    return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, 36)
+    return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, ZERNIKE_TERMS)
 
 
 def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
     """Rows with a covariance, and the (k, 36, 36) matrices."""
     if "covariance_um2" not in table.column_names:
-        return np.empty(0, dtype=np.int64), np.empty((0, 36, 36))
+        return np.empty(0, dtype=np.int64), np.empty((0, ZERNIKE_TERMS, ZERNIKE_TERMS))
     cells = table.column("covariance_um2").combine_chunks()
     lengths = np.diff(np.asarray(cells.offsets))
     values = np.asarray(cells.flatten(), dtype=np.float64)
-    whole = lengths == 36 * 36
-    return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, 36, 36)
+    whole = lengths == ZERNIKE_TERMS**2
+    return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, ZERNIKE_TERMS, ZERNIKE_TERMS)
 
 
 BARS_PATH = "/shape/change_bars"
 WATERFALL_PATH = "/shape/waterfall"
-WATERFALL_TERMS = slice(3, None)  # Z4 to Z36: tilts are hundreds of times larger
+WATERFALL_TERMS = slice(FIRST_FIGURE_INDEX - 1, None)  # tilts are hundreds of times larger
 # The maps below `/shape/map/`, and their names for people.
 MAPS = {
     "height": "height",
@@ -245,8 +246,8 @@ class Scatter:
 
     def __init__(self) -> None:
         self.count = 0
-        self._mean = np.zeros(shape_estimate.TERMS)
-        self._squares = np.zeros((shape_estimate.TERMS, shape_estimate.TERMS))
+        self._mean = np.zeros(ZERNIKE_TERMS)
+        self._squares = np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS))
 
     def add(self, coeffs_um: NDArray[np.float64]) -> None:
         """Add (36,) coefficients."""

@@ -21,6 +21,7 @@ from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, 
 from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, TelemetryColumn
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import Rows, column
+from membrane_ctrl.model.zernike_terms import zernike_labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ LOW_ORDERS = {
     11: ("spherical Z11 µm", RED),
 }
 
-ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"Z{j} µm", GREY) for j in range(1, 37)))
+ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"{label} µm", GREY) for label in zernike_labels()))
 CHANGE = Stream("/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values()))
 PUMP = Stream("/pump/scale", (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)))
 VIBRATIONS = Stream("/shape/vibrations", tuple(Line("", f"mode {k} Hz", GREY) for k in range(1, 9)))

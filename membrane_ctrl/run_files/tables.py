@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.controller.tick import RECORD, SAME, TickBatch
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.column_file import ColumnFile
 
@@ -194,8 +195,8 @@ def shape_schema() -> pa.Schema:
             ("cycle", pa.int64()),
             ("tracking_lost", pa.bool_()),
             *((name, pa.string()) for name in ("kind", "verdict", "reason")),
-            ("coeffs_um", pa.list_(pa.float64(), shape_estimate.TERMS)),
-            ("upper_um2", pa.list_(pa.float32(), shape_estimate.UPPER_TERMS)),
+            ("coeffs_um", pa.list_(pa.float64(), ZERNIKE_TERMS)),
+            ("upper_um2", pa.list_(pa.float32(), COVARIANCE_UPPER_SIZE)),
             ("covariance_um2", pa.list_(pa.float32())),
         ]
     )

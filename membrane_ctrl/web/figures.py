@@ -13,6 +13,7 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, zernike_labels
 from membrane_ctrl.run_files import shapes
 from membrane_ctrl.web.feed import UNITS, Series
 from membrane_ctrl.web.work_pools import WorkPool
@@ -91,18 +92,19 @@ def _plain(value: float) -> float | None:
 
 
 def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
-    """Options of the bar chart of Noll 4..36, as change since the reference, um, with its standard deviation."""
+    """Options of the bar chart of the terms from Z4: change since the reference, um, with its standard deviation."""
+    shown = slice(FIRST_FIGURE_INDEX - 1, None)
     change_um = figure.coeffs_um - reference.coeffs_um if reference is not None else figure.coeffs_um
     sigma_um = np.sqrt(np.diag(figure.covariance_um2))
     return {
         "animation": False,
         "grid": {"left": 56, "right": 12, "top": 16, "bottom": 40},
         "tooltip": {"trigger": "axis"},
-        "xAxis": {**_axis("", 0), "type": "category", "data": [f"Z{j}" for j in range(4, 37)]},
+        "xAxis": {**_axis("", 0), "type": "category", "data": zernike_labels(FIRST_FIGURE_INDEX)},
         "yAxis": {**_axis("um", 40), "type": "value"},
         "series": [
-            {"type": "bar", "name": "change, um", "data": [_plain(v) for v in change_um[3:]]},
-            {"type": "scatter", "name": "sigma, um", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[3:]]},
+            {"type": "bar", "name": "change, um", "data": [_plain(v) for v in change_um[shown]]},
+            {"type": "scatter", "name": "sigma, um", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[shown]]},
         ],
     }
 

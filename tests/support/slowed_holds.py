@@ -34,12 +34,11 @@ from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualClock
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
+from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX, ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes import ring
 from tests.support.loop_bench import LoopBench
 
-_SHAPE_BYTES = 1 << 16
 _START_S = 180.0
 
 
@@ -73,7 +72,7 @@ async def hold(logs: Path, number: int) -> None:
     run = logs / f"{utc:%Y%m%dT%H%M%SZ}-held"
     await asyncio.to_thread(run.mkdir, parents=True)
     with ExitStack() as stack:
-        sizes = {"telemetry": (3000, ROW_BYTES), "events": (64, 4096), "shapes": (8, _SHAPE_BYTES)}
+        sizes = {"telemetry": (3000, ROW_BYTES), "events": (64, 4096), "shapes": (8, ESTIMATE_BYTES_MAX)}
         rings = {name: stack.enter_context(ring.ring(*size)) for name, size in sizes.items()}
         writers = {
             name: stack.enter_context(contextlib.closing(ring.RingWriter(each))) for name, each in rings.items()

@@ -177,7 +177,8 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
 
 _MOUNTED_MM = np.zeros(PARAMETERS)
 _MOUNTED_MM[[3, 5, 7]] = 0.3, 0.1, 0.05  # astigmatism, coma, trefoil; and 10 um RMS over the terms above
-_MOUNTED_MM[9:35] = 0.01 / np.sqrt(26) * (-1.0) ** np.arange(26)
+_HIGHER = np.arange(9, PARAMETERS - 1)  # Noll 11 and all terms above
+_MOUNTED_MM[_HIGHER] = 0.01 / np.sqrt(_HIGHER.size) * (-1.0) ** np.arange(_HIGHER.size)
 _ACROSS = 48  # rays along the picture's longer side; twice as many change a claim by less than a fiftieth
 
 

@@ -34,6 +34,7 @@ from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 # of one set: its surface's 36, the height of its vertex, its round terms beyond the 36, and by how much the film was
 # deeper in the x frames than in the y frames
@@ -333,9 +334,9 @@ def round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, F
 def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
     """x^p y^q, p + q <= 7, p outer, (36, n)."""
     out, column = [], np.ones_like(x)
-    for p in range(zernike.DEGREE + 1):
+    for p in range(ZERNIKE_DEGREE + 1):
         term = column
-        for _ in range(zernike.DEGREE + 1 - p):
+        for _ in range(ZERNIKE_DEGREE + 1 - p):
             out.append(term)
             term = term * y
         column = column * x
@@ -345,7 +346,7 @@ def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
 @cache
 def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Z_j, dZ_j/dx and dZ_j/dy, j = 2..36, as coefficients (35, 36) of `_monomials`."""
-    p, q = np.array([(p, q) for p in range(zernike.DEGREE + 1) for q in range(zernike.DEGREE + 1 - p)]).T
+    p, q = np.array([(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]).T
     table = zernike.monomial_table()
     height, of_x, of_y = (t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2))))
     return np.ascontiguousarray(height), np.ascontiguousarray(of_x), np.ascontiguousarray(of_y)

@@ -20,10 +20,10 @@ import numpy as np
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface, beyond_of
-from membrane_ctrl.metrology.optics.zernike import DEGREE
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-RING = 2 * DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
+RING = 2 * ZERNIKE_DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 # The film as a check of the geometry. Its round terms beyond the 36 are a micrometre of a 37 mm bowl, and a nanometre
 # of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever slackness
@@ -298,7 +298,7 @@ def rim_harmonics() -> FloatArray:
     """Matrix (RING, 36) from the surface's parameters to the harmonics of the rim's height above the vertex."""
     theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
     heights = residuals.basis(np.cos(theta), np.sin(theta))[0]
-    orders = np.outer(np.arange(1, DEGREE + 1), theta)
+    orders = np.outer(np.arange(1, ZERNIKE_DEGREE + 1), theta)
     waves = np.vstack([np.full((1, theta.size), 0.5), np.cos(orders), np.sin(orders)])
     return np.asarray(waves @ heights.T * 2 / theta.size)
 

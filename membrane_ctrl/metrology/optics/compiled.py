@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numba import njit
 
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+
 # Sums may be reordered, which vector units need; NaN and infinity keep their meaning.
 _OPTIONS: dict[str, Any] = {
     "cache": True,
@@ -34,13 +36,15 @@ def step(function: Callable[..., Any]) -> Any:
 def _recompiled_if_stale(dispatcher: Any) -> Any:
     """Let an index of the cache that is of other sources, or that cannot be read, count as empty.
 
-    A kernel contains the kernels that it calls, but Numba looks for changes only in its own file. And it raises if an
+    A kernel contains the kernels that it calls and the number of Zernike terms, but Numba looks for changes only in
+    its own file. And it raises if an
     index was cut by a power failure, or names the classes of arguments by modules that are gone.
     """
     file = getattr(dispatcher._cache, "_cache_file", None)  # None where no folder is writable
     if file is not None:
         source = Path(dispatcher.py_func.__code__.co_filename)
-        file._source_stamp = file._source_stamp, _sources(_FOLDER if _FOLDER in source.parents else source.parent)
+        sources = _sources(_FOLDER if _FOLDER in source.parents else source.parent)
+        file._source_stamp = file._source_stamp, sources, ZERNIKE_TERMS
         load = file._load_index
 
         def load_index() -> dict[Any, str]:

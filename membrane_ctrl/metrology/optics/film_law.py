@@ -28,8 +28,8 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Legendre, Polynomial, chebyshev, legendre
 from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 SLACKEST = 21.0  # the series' last term is then below 1e-12; a slacker film wrinkles at its ring
 _USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 600 Pa
@@ -279,13 +279,16 @@ def _finite_tables() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 # Hencky's bowl: the law without pre-strain, as a polynomial in v.
 #
 # Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with Legendre's P_k, so the
-# Legendre series of the profile *is* its Zernike expansion. P_0..P_3 are Noll 1, 4, 11 and 22 and among the 36 terms;
-# the rest is the "excess", some micrometres of a 37 mm bowl.
+# Legendre series of the profile *is* its Zernike expansion: P_0, P_1, P_2, ... are Noll 1, 4, 11, ... What lies above
+# the degree of the fit is the "excess", with 36 terms some micrometres of a 37 mm bowl.
 
 POISSON_RATIO = 0.3
 # Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of the sag
 EXCESS_TERMS = 15
-_CARRIED = {0: 1, 1: 4, 2: 11, 3: 22}  # Legendre degree -> Noll index
+# Noll indices of the round terms that the fit has, by Legendre degree: the first of order n = 2k has (n^2 + n) / 2
+# terms before it, and its m = 0
+ROUND_NOLL = tuple(k * (2 * k + 1) + 1 for k in range(ZERNIKE_DEGREE // 2 + 1))
+EXCESS_DEGREE = len(ROUND_NOLL)  # Legendre degree of the excess' largest part
 
 
 @cache
@@ -304,8 +307,8 @@ def legendre_series(bowl: Bowl, degree: int) -> Legendre:
 @cache
 def zernike_projection() -> FloatArray:
     """Noll coefficients (36,) of a Hencky bowl of unit sag; also their change per unit of sag."""
-    out = np.zeros(TERMS)
-    for degree, j in _CARRIED.items():
+    out = np.zeros(ZERNIKE_TERMS)
+    for degree, j in enumerate(ROUND_NOLL):
         out[j - 1] = profile_legendre().coef[degree] / np.sqrt(2 * degree + 1)
     out.setflags(write=False)
     return out
@@ -315,14 +318,14 @@ def zernike_projection() -> FloatArray:
 def excess() -> FloatArray:
     """Power series in v of the part of a bowl of unit sag that the 36 terms cannot represent."""
     coef = profile_legendre().coef.copy()
-    coef[list(_CARRIED)] = 0.0
+    coef[:EXCESS_DEGREE] = 0.0
     out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef
     out.setflags(write=False)
     return np.asarray(out)
 
 
-# Round terms beyond the 36 that a calibration does not take from Hencky: Legendre degrees 5 to 7, of unit RMS
-BEYOND = (5, 6, 7)
+# Round terms beyond the fit's that a calibration does not take from Hencky: three Legendre degrees, of unit RMS
+BEYOND = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
 
 
 @cache
@@ -341,7 +344,7 @@ def excess_rms() -> float:
     """RMS over the disc of the excess of a bowl of unit sag."""
     coef: FloatArray = np.asarray(profile_legendre().coef).astype(np.float64)
     squares = coef**2 / (2 * np.arange(EXCESS_TERMS) + 1)
-    return float(np.sqrt(np.sum(np.delete(squares, list(_CARRIED)))))
+    return float(np.sqrt(np.sum(squares[EXCESS_DEGREE:])))
 
 
 def profile(rho: FloatArray) -> FloatArray:

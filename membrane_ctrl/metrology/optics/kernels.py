@@ -16,14 +16,14 @@ import numpy as np
 
 from membrane_ctrl.metrology.optics import film_law, geometry
 from membrane_ctrl.metrology.optics.compiled import kernel, step
-from membrane_ctrl.metrology.optics.zernike import DEGREE
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 FACE_STEPS = 6  # see `_onto_face`
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
 
-SLOPE_MONOMIALS = DEGREE * (DEGREE + 1) // 2  # x^p y^q with p + q <= 6: 28
+SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q <= 6: 28
 SUMS = 2 * SLOPE_MONOMIALS + 5  # moments of r_x and of r_y, two for the excess, sum w r_x^2, sum w r_y^2, sum w
-PRODUCT_DEGREE = 2 * (DEGREE - 1)
+PRODUCT_DEGREE = 2 * (ZERNIKE_DEGREE - 1)
 PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <= 12: 91
 PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
@@ -34,10 +34,10 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     h = 0.0
     hx = 0.0
     hy = 0.0
-    for i in range(DEGREE, -1, -1):
+    for i in range(ZERNIKE_DEGREE, -1, -1):
         row = 0.0
         slope = 0.0
-        for j in range(DEGREE - i, -1, -1):
+        for j in range(ZERNIKE_DEGREE - i, -1, -1):
             slope = slope * y + row
             row = row * y + poly[i, j]
         hx = hx * x + h
@@ -161,7 +161,7 @@ def residual_sums(rays, t, screen, weights, pinhole, plane, face, poly, excess, 
     sums = np.zeros(SUMS)
     block = np.empty((5, _BLOCK))
     xs, ys, rx, ry, off = block[0], block[1], block[2], block[3], block[4]
-    powers_y = np.empty((DEGREE, _BLOCK))
+    powers_y = np.empty((ZERNIKE_DEGREE, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
         x_excess = 0.0
@@ -207,7 +207,7 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
     block = np.empty((5, _BLOCK))
     xs, ys, ws, ex, ey = block[0], block[1], block[2], block[3], block[4]
     powers_y = np.empty((PRODUCT_DEGREE + 1, _BLOCK))
-    flat = np.zeros((DEGREE + 1, DEGREE + 1))
+    flat = np.zeros((ZERNIKE_DEGREE + 1, ZERNIKE_DEGREE + 1))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
         for k in range(count):
@@ -222,8 +222,8 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
             sums[PRODUCTS - 1] += ey[k] * ev * ys[k]
         _powers(ys, powers_y, count)
         _add_moments(ws, xs, powers_y, count, sums, 0)
-        _add_moments(ex, xs, powers_y[:DEGREE], count, sums, PRODUCT_MONOMIALS)
-        _add_moments(ey, xs, powers_y[:DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS)
+        _add_moments(ex, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS)
+        _add_moments(ey, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS)
     return sums
 
 

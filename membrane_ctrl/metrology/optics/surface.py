@@ -13,8 +13,9 @@ from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.metrology.optics import film_law, zernike
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
-PARAMETERS = 36  # j = 2..36 and the excess; piston follows from h(0) = 0
+PARAMETERS = ZERNIKE_TERMS  # all but piston, which follows from h(0) = 0, and the excess
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,8 @@ def parameter_to_coeffs() -> FloatArray:
 
     Row 1 is the piston that puts the vertex at 0: a_1 = -(sum over j >= 2 of a_j Z_j(0) + excess(0)).
     """
-    out = np.zeros((zernike.TERMS, PARAMETERS))
-    out[1:, :-1] = np.eye(zernike.TERMS - 1)
+    out = np.zeros((ZERNIKE_TERMS, PARAMETERS))
+    out[1:, :-1] = np.eye(ZERNIKE_TERMS - 1)
     out[0, :-1] = -zernike.at_vertex()[1:]
     out[0, -1] = -film_law.excess()[0] / film_law.excess_rms()
     return out
@@ -144,12 +145,12 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @cache
 def _family() -> tuple[FloatArray, FloatArray]:
-    """Legendre degree 4 (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
+    """`EXCESS_DEGREE` (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
     rows = []
     for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
         bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), film_law.POISSON_RATIO, 1.0)
         coef = film_law.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
-        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (4, *film_law.BEYOND)])
+        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (film_law.EXCESS_DEGREE, *film_law.BEYOND)])
     table = np.array(rows)
     return table[:, 0], table[:, 1:]
 
@@ -160,12 +161,12 @@ def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
     At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
     """
     own = (
-        film_law.profile_legendre().coef[[4, *film_law.BEYOND]]
-        / np.sqrt(2 * np.array([4, *film_law.BEYOND]) + 1)
+        film_law.profile_legendre().coef[[film_law.EXCESS_DEGREE, *film_law.BEYOND]]
+        / np.sqrt(2 * np.array([film_law.EXCESS_DEGREE, *film_law.BEYOND]) + 1)
         / film_law.excess_rms()
     )
-    fourth, others = _family()
-    there = [np.interp(excess_mm * own[0] / sag_mm, fourth, other) for other in others.T]
+    first, others = _family()
+    there = [np.interp(excess_mm * own[0] / sag_mm, first, other) for other in others.T]
     return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])
 
 

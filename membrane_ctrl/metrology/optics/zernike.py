@@ -14,10 +14,9 @@ import numpy as np
 from numpy.polynomial.legendre import legvander, poly2leg
 
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE, ZERNIKE_TERMS
 
-TERMS = 36
-DEGREE = 7
-FRINGE_TERMS = 37
+FRINGE_TERMS = 37  # by definition of the set, whatever the fit's own number
 
 
 def noll(j: int) -> tuple[int, int]:
@@ -32,8 +31,8 @@ def noll(j: int) -> tuple[int, int]:
 
 def osa_from_noll(per_term: FloatArray) -> FloatArray:
     """Values (36, ...) per term in the order of OSA/ANSI's index j = 0..35, of the same terms in Noll's order."""
-    orders = [noll(j) for j in range(1, TERMS + 1)]
-    return np.asarray(per_term)[sorted(range(TERMS), key=orders.__getitem__)]
+    orders = [noll(j) for j in NOLL_INDICES]
+    return np.asarray(per_term)[sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)]
 
 
 def fringe(j: int) -> tuple[int, int]:
@@ -51,7 +50,7 @@ def fringe(j: int) -> tuple[int, int]:
 @cache
 def monomial_table() -> FloatArray:
     """Coefficients (36, 8, 8): Z_j = sum over p, q of table[j - 1, p, q] x^p y^q, on the unit disc."""
-    table = np.stack([_polynomial(j) for j in range(1, TERMS + 1)])
+    table = np.stack([_polynomial(j) for j in NOLL_INDICES])
     table.setflags(write=False)
     return table
 
@@ -59,7 +58,7 @@ def monomial_table() -> FloatArray:
 def _polynomial(j: int) -> FloatArray:
     """One of the 36 terms, with unit RMS over the disc."""
     n, m = noll(j)
-    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * term(n, m, DEGREE)
+    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * term(n, m, ZERNIKE_DEGREE)
 
 
 def term(n: int, m: int, degree: int) -> FloatArray:
@@ -85,9 +84,9 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
 def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
     """All terms, (36, ...), at points of the unit disc; or the polynomials of a table like theirs."""
     table = monomial_table() if table is None else table
-    p, q = np.array([(p, q) for p in range(DEGREE + 1) for q in range(DEGREE + 1 - p)]).T
-    powers_x = np.stack([x**k for k in range(DEGREE + 1)])
-    powers_y = np.stack([y**k for k in range(DEGREE + 1)])
+    p, q = np.array([(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]).T
+    powers_x = np.stack([x**k for k in range(ZERNIKE_DEGREE + 1)])
+    powers_y = np.stack([y**k for k in range(ZERNIKE_DEGREE + 1)])
     return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
@@ -98,7 +97,7 @@ def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def differentiate(table: FloatArray, axis: int) -> FloatArray:
     """Derivative of polynomials whose powers run along `axis` (1: x, 2: y), in the same shape."""
-    powers = np.arange(DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(3)])
+    powers = np.arange(ZERNIKE_DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(3)])
     out = np.roll(table * powers, -1, axis=axis)
     return np.asarray(out)
 
@@ -110,7 +109,7 @@ def at_vertex() -> FloatArray:
 
 def at_rim() -> FloatArray:
     """Mean over azimuth (36,) of all terms on the rim: only m = 0 is left, with R(1) = 1."""
-    orders = [noll(j) for j in range(1, TERMS + 1)]
+    orders = [noll(j) for j in NOLL_INDICES]
     return np.array([math.sqrt(n + 1) if m == 0 else 0.0 for n, m in orders])
 
 

@@ -23,9 +23,9 @@ from membrane_ctrl.metrology.frames.bands import Bands, fitted_waves
 from membrane_ctrl.metrology.optics import kernels
 from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, height_probe
-from membrane_ctrl.metrology.optics.zernike import TERMS
 from membrane_ctrl.metrology.track.scene import CrossedScene, light_left, light_waves
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 TOLERANCE_MM = 3e-6  # last change of height at the rim, of which a seventh is left: 0.4 nm there, 0.04 of the terms
 _MAX_STEPS = 10
@@ -38,8 +38,9 @@ _ASTRAY_MM = 2.0  # a step beyond which nothing is linear
 _LINEAR_MM = 1e-3  # at the rim; between two exact traces phases follow their derivatives: 0.3 nm off at most
 _SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
 Shifts = tuple[float, float]  # phase steps of x and y
-_UNKNOWNS = PARAMETERS + 3 * TERMS
-_STARTS = 0, 0, PARAMETERS, PARAMETERS + TERMS, PARAMETERS + 2 * TERMS  # of the unknowns that turn each wave
+_UNKNOWNS = PARAMETERS + 3 * ZERNIKE_TERMS
+# Of the unknowns that turn each wave
+_STARTS = 0, 0, PARAMETERS, PARAMETERS + ZERNIKE_TERMS, PARAMETERS + 2 * ZERNIKE_TERMS
 # Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In smaller ones light that
 # wanders leaves more than it does in all.
 _BLOCKS = 14
@@ -121,7 +122,7 @@ class FrameFitter:
                 break
             delta, last = self._inverse @ self._right(), change
             shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
-            light += delta[PARAMETERS:_UNKNOWNS].reshape(3, TERMS)
+            light += delta[PARAMETERS:_UNKNOWNS].reshape(3, ZERNIKE_TERMS)
             bands = bands + delta[_UNKNOWNS:]
             change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
             if not TOLERANCE_MM < change < _ASTRAY_MM:

@@ -11,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from membrane_ctrl.metrology.frames.bands import Bands
-from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track import tracked
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 _FAR_OFF = 0.05  # over the swing: dust that moved is no lost order
 _OUT_USUAL = 0.01  # dust and glints
@@ -65,7 +66,7 @@ class Tracker:
         self._bands = Bands(scene.row)
         self._fitter = FrameFitter(scene, self._bands)
         self._jumps = tracked.Jumps()
-        self._begin(scene, scene.surface, np.zeros((3, zernike.TERMS)))
+        self._begin(scene, scene.surface, np.zeros((3, ZERNIKE_TERMS)))
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
         self._anchor_light = math.nan
         self._orders = tracked.LostOrders(self._fitter)

@@ -14,6 +14,7 @@ from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, LEAST_S, MOVED, SEARCH_S, VibrationMode, find_modes
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import is_run
 
@@ -103,11 +104,11 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
         if path is None:
             raise errors.InputError(f"{folder}: neither a run nor the result of `membrane-ctrl track`")
         try:
-            time_s, coeffs_um = read_arrays(path, ("time_s", "coeffs_um"), _FRAMES_MOST * zernike.TERMS)
+            time_s, coeffs_um = read_arrays(path, ("time_s", "coeffs_um"), _FRAMES_MOST * ZERNIKE_TERMS)
         except (OSError, ValueError) as error:
             raise errors.InputError(f"{path}: {error}") from None
-        if coeffs_um.shape != (time_s.size, zernike.TERMS):
-            raise errors.InputError(f"{path}: coeffs_um: not {zernike.TERMS} terms for each time_s")
+        if coeffs_um.shape != (time_s.size, ZERNIKE_TERMS):
+            raise errors.InputError(f"{path}: coeffs_um: not {ZERNIKE_TERMS} terms for each time_s")
         origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
     good = np.isfinite(time_s) & (verdict != "rejected") & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
     order = np.argsort(time_s[good], kind="stable")

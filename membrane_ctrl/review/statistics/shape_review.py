@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray, Column
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.review.statistics.drift import FittedSlope, slope
 from membrane_ctrl.run_files.shapes import Shapes, height_basis
 
@@ -43,7 +44,7 @@ class ShapeReview:
     points_um: dict[str, Column]  # (n,) change of height at `POINTS` against the first cycle
     sd_um: Column  # (MAP_PX, MAP_PX): standard deviation of the height
     mean_sd_um: float  # mean over the area
-    drift_um_per_hour: tuple[FittedSlope, ...]  # of Z2..Z36
+    drift_um_per_hour: tuple[FittedSlope, ...]  # of Z2 and all terms above
     sag_um: Column  # (n,): changes by camera and by laser since the first cycle
     laser_um: Column  # (n,)
     disagreement: FittedSlope  # of sag by the camera minus laser: the mount's drift, or the films'
@@ -121,7 +122,7 @@ def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CycleP
     covariances = [good.covariance_near(float(time_s[k])) for k in (first, second)]
     sigma_um = None
     if covariances[0] is not None and covariances[1] is not None:
-        variance = _quadratic(area.basis[:36], covariances[0] + covariances[1])
+        variance = _quadratic(area.basis[:ZERNIKE_TERMS], covariances[0] + covariances[1])
         sigma_um = np.sqrt(np.maximum(variance, 0.0))
     return CyclePair(
         first_s=float(time_s[first]),

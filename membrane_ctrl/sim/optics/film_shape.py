@@ -1,4 +1,4 @@
-"""Shape of the film: a bowl, Zernike terms, and what 36 Zernike terms cannot represent.
+"""Shape of the film: a bowl, Zernike terms, and what these terms cannot represent.
 
 Frame: the mirror's own, x horizontal, y up, height h above the vertex, h(0, 0) = 0. The displacement's zero is where
 the bowl has `sag_mm`; the rim stays where it is, so the bowl is `sag_mm + displacement` deep and everything else
@@ -14,9 +14,11 @@ import numpy as np
 from numba import njit
 
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim import film as gas_film
 
-MAX_ZERNIKE = 36  # all terms of radial order 7 or less
+MAX_FILM_TERMS = 66  # Noll's, up to radial order 10: finer errors are ripples, wrinkles and bumps
+_TYPICAL_TERMS = 36  # of a mounted film, up to radial order 7; the film does not depend on how many are fitted
 _SPHERE_TERMS = 40  # those left out are below 1e-12 for radii up to half of the curvature's
 _Form = Literal["hencky", "paraboloid", "sphere"]
 
@@ -240,8 +242,8 @@ class FilmShape:
             raise ValueError(f"sag_mm = {self.sag_mm:g}: a concave sphere's is above 0 and below its radius")
         if not all(isfinite(c) for c in self.zernike_um):
             raise ValueError("zernike_um: every value must be a number")
-        if len(self.zernike_um) > MAX_ZERNIKE:
-            raise ValueError(f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_ZERNIKE} are known")
+        if len(self.zernike_um) > MAX_FILM_TERMS:
+            raise ValueError(f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_FILM_TERMS} are known")
         if not 0 <= self.poisson <= 0.5:
             raise ValueError(f"poisson = {self.poisson:g} is outside 0 .. 0.5")
         object.__setattr__(self, "terms", _terms(self))
@@ -268,14 +270,17 @@ class FilmShape:
         return np.reshape(flat, np.shape(x_mm))
 
     def coeffs_um(self, displacement_um: float = 0.0) -> FloatArray | None:
-        """Noll j = 1..36 of the whole surface, 0 at the vertex; None if 36 terms cannot represent it.
+        """Noll terms (ZERNIKE_TERMS,) of the whole surface, 0 at the vertex; None if they cannot represent it.
 
         A paraboloid s rho^2 is s/(2 sqrt 3) of Z4 = sqrt(3) (2 rho^2 - 1) above a piston of s/2.
         """
         if self.bowl != "paraboloid" or self.ripples or self.wrinkles or self.bumps:
             return None
-        coeffs = np.zeros(MAX_ZERNIKE)
-        coeffs[: len(self.zernike_um)] = self.zernike_um
+        if any(self.zernike_um[ZERNIKE_TERMS:]):
+            return None
+        coeffs = np.zeros(ZERNIKE_TERMS)
+        own_um = self.zernike_um[:ZERNIKE_TERMS]
+        coeffs[: len(own_um)] = own_um
         coeffs[3] += 1000.0 * self.sag_at_mm(displacement_um) / (2.0 * sqrt(3.0))
         coeffs[0] = 0.0
         coeffs[0] = -polynomial(coeffs)[0, 0]
@@ -310,11 +315,11 @@ def typical_film(
     and 10 um RMS spread over the terms above.
     """
     rng = np.random.default_rng(seed)
-    coeffs_um = np.zeros(MAX_ZERNIKE)
+    coeffs_um = np.zeros(_TYPICAL_TERMS)
     for amplitude_um, sine, cosine in ((300.0, 5, 6), (100.0, 7, 8), (50.0, 9, 10)):
         angle = rng.uniform(0.0, 2.0 * pi)
         coeffs_um[sine - 1], coeffs_um[cosine - 1] = amplitude_um * sin(angle), amplitude_um * cos(angle)
-    higher = rng.normal(size=MAX_ZERNIKE - 10)
+    higher = rng.normal(size=_TYPICAL_TERMS - 10)
     coeffs_um[10:] = 10.0 * higher / sqrt(float(np.dot(higher, higher)))
     figure = tuple(float(c) for c in coeffs_um)
     return FilmShape(sag_mm, radius_mm, prestrain=prestrain, poisson=poisson, zernike_um=figure)

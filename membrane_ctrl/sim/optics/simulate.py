@@ -57,7 +57,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
 
     `truth.npz`: `x_mm` (W,), `y_mm` (H,), `h_mm` (H, W) above the vertex, NaN outside the rim, at the mean
     displacement of the sinusoids; `h_per_sag` (H, W), its change with sag; `displacement_um` (frames,); `coeffs_um`
-    (36,), Noll j = 1..36 with the surface 0 at the vertex, if 36 terms represent the shape.
+    (ZERNIKE_TERMS,), Noll with the surface 0 at the vertex, if these terms represent the shape.
     `truth.json`: the same numbers without the maps, and the request.
     """
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
@@ -184,8 +184,8 @@ def simulate_track(
     """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock and motion.
 
     The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`, `sag_um` (frames,)
-    and, if 36 terms represent the film, `coeffs_um` (frames, 36), all without the vibrations, `drum_um` (frames,
-    modes): RMS over the mirror. `on_frame` gets the number of frames written.
+    and, if these represent the film, `coeffs_um` (frames, ZERNIKE_TERMS), all without the vibrations, `drum_um`
+    (frames, modes): RMS over the mirror. `on_frame` gets the number of frames written.
     Raises ValueError for frames or a rate that are not above 0, and for a specification that is not of a full set.
     """
     if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:

@@ -80,21 +80,25 @@ class Motion:
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
+# Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a nanometre.
+_LEANING_TERMS = 36
+
+
 def leaning(
     curvature_mm: float, radius_mm: float, lean_x: float, lean_y: float, form_um: FloatArray | None = None
 ) -> film_shape.FilmShape:
     """A concave sphere, or a flat (infinite radius of curvature), in the mirror's place.
 
     Its slopes at the vertex are `lean_x`, `lean_y`: a sphere that leans by 1 mrad has micrometres of coma. `form_um`
-    (36,) are Noll terms of its form error.
+    (terms,) are Noll terms of its form error.
     """
-    coeffs_um = np.zeros(film_shape.MAX_ZERNIKE) if form_um is None else np.array(form_um)
+    coeffs_um = np.zeros(_LEANING_TERMS) if form_um is None else np.array(form_um)
     coeffs_um[1:3] += 1e3 * radius_mm / 2 * np.array([lean_x, lean_y])
     if isinf(curvature_mm):
         return film_shape.FilmShape(0.0, radius_mm, "paraboloid", tuple(coeffs_um.tolist()))
     rho, theta = np.meshgrid(np.sqrt((np.arange(40) + 0.5) / 40), 2 * pi * np.arange(40) / 40)
     x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
-    terms = [film_shape.polynomial(row) for row in np.eye(film_shape.MAX_ZERNIKE)]
+    terms = [film_shape.polynomial(row) for row in np.eye(coeffs_um.size)]
     design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
     # the centre is at R (-lean_x, -lean_y, 1) / length
     centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / sqrt(1 + lean_x**2 + lean_y**2)

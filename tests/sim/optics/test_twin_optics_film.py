@@ -140,7 +140,7 @@ def test_what_36_terms_cannot_carry_has_no_coefficients() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: FilmShape(37.1, zernike_um=(0.0,) * 37), "zernike_um holds 37"),
+        (lambda: FilmShape(37.1, zernike_um=(0.0,) * 67), "zernike_um holds 67 terms; at most 66"),
         (lambda: FilmShape(37.1, zernike_um=(float("nan"),)), "zernike_um: every value"),
         (lambda: FilmShape(float("inf")), "sag_mm = inf"),
         (lambda: FilmShape(37.1, radius_mm=0.0), "radius_mm = 0"),
