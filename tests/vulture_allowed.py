@@ -36,3 +36,5 @@ _.shape_reason, _.state_age_s, _.trial_left_s, _.commander, _.command_session, _
 _.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _.since_utc, _.kp_per_s, _.ti_s, _.td_s
 find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults.md, the safety case and the campaign
 _.sent  # of an event, written as a whole
+_.writable  # of a file that Arrow writes to
+TableReader, TableWriter, _.known_until_s, _.note_missing, _.check_all, _.newest, _.lost, _.parts, _.leave_folder

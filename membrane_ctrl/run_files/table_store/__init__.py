@@ -1,0 +1,1 @@
+"""Tables of a run: Parquet parts that any program reads, and a journal of the newest rows (docs/recording.md)."""

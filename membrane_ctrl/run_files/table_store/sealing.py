@@ -1,0 +1,72 @@
+"""Makes a part of a closed journal: write, sync, rename, record, and only then remove the journal."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow as pa
+
+from membrane_ctrl.model.files import read_bytes
+from membrane_ctrl.run_files.table_store import spec
+from membrane_ctrl.run_files.table_store.disk import Disk
+from membrane_ctrl.run_files.table_store.journal import FILE_BYTES_MAX, JournalBlock, LostBytes, read_journal
+from membrane_ctrl.run_files.table_store.manifest import append_entry, read_manifest
+from membrane_ctrl.run_files.table_store.part_writer import write_part
+
+
+def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -> None:
+    """Make the part of a journal; may be repeated after a kill at any step.
+
+    A journal without any intact row stays, for people. Raises OSError (full disk, or a journal that cannot be read):
+    the journal stays as well.
+    """
+    source, target = spec.journal_path(folder, number), spec.part_path(folder, number)
+    if target.exists() and number in read_manifest(folder, []):
+        disk.remove(source)
+        return
+    rows = _JournalRows(read_bytes(source, FILE_BYTES_MAX), table.schema)
+    try:
+        entry = write_part(disk, target, number, rows.first_row, rows.groups(), table.time_name)
+    except (ValueError, pa.ArrowException) as error:
+        raise OSError(f"{source.name}: cannot be sealed ({error})") from None
+    if entry is not None:
+        append_entry(disk, folder, entry.model_copy(update={"damage": tuple(rows.damage)}))
+    if entry is not None or not rows.damage:
+        disk.remove(source)
+
+
+class _JournalRows:
+    """The rows of a journal, read once; `damage` describes what is lost of it."""
+
+    def __init__(self, data: bytes, schema: pa.Schema) -> None:
+        self.damage: list[str] = []
+        self._blocks = read_journal(data, spec.GROUP_ROWS, schema)
+        self._first = self._next_block()
+        self.first_row = self._first.first_row if self._first is not None else 0
+
+    def groups(self) -> Iterator[pa.Table]:
+        """Tables of about `GROUP_ROWS` rows."""
+        waiting: list[pa.Table] = []
+        count = 0
+        block = self._first
+        while block is not None:
+            waiting.append(block.table)
+            count += block.table.num_rows
+            if count >= spec.GROUP_ROWS:
+                yield pa.concat_tables(waiting).combine_chunks()
+                waiting, count = [], 0
+            block = self._next_block()
+        if waiting:
+            yield pa.concat_tables(waiting).combine_chunks()
+
+    def _next_block(self) -> JournalBlock | None:
+        for block in self._blocks:
+            if isinstance(block, JournalBlock):
+                return block
+            self.damage.append(describe_lost_bytes(block))
+        return None
+
+
+def describe_lost_bytes(lost: LostBytes) -> str:
+    """A damaged stretch of a journal in words."""
+    where = "at the end" if lost.at_end else "within"
+    return f"{lost.size_bytes} bytes {where} are no intact rows"

@@ -1,0 +1,52 @@
+"""What a table is: its name, its columns, and the limits of its files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+
+# A part holds at most this much of a run, so that a damaged file costs at most an hour.
+PART_S = 3600.0
+# A row group is the smallest unit that is read or lost: 10 minutes at 50 Hz.
+GROUP_ROWS = 30_000
+PART_SUFFIX = ".parquet"
+JOURNAL_SUFFIX = ".journal"
+MANIFEST = "manifest.jsonl"
+_DIGITS = 4  # ten thousand hours
+
+
+@dataclass(frozen=True, slots=True)
+class TableSpec:
+    """A table of a run.
+
+    Attributes
+    ----------
+    name : str
+        Of the table and its folder.
+    schema : pyarrow.Schema
+        Its columns; units and descriptions are metadata of the fields.
+    time_name : str
+        A column of rising seconds of the run.
+    """
+
+    name: str
+    schema: pa.Schema
+    time_name: str
+
+
+def part_path(folder: Path, number: int) -> Path:
+    """The finished part of a number in a table's folder."""
+    return folder / f"{folder.name}-{number:0{_DIGITS}d}{PART_SUFFIX}"
+
+
+def journal_path(folder: Path, number: int) -> Path:
+    """The journal that becomes the part of the same number."""
+    return folder / f"{folder.name}-{number:0{_DIGITS}d}{JOURNAL_SUFFIX}"
+
+
+def file_number(path: Path) -> int | None:
+    """Number of a part or a journal; None for any other file."""
+    stem, _, digits = path.stem.rpartition("-")
+    if stem != path.parent.name or not (digits.isascii() and digits.isdigit() and len(digits) >= _DIGITS):
+        return None
+    return int(digits) if len(digits) <= 2 * _DIGITS else None
