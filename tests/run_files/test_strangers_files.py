@@ -156,7 +156,8 @@ _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
     "processes/child.py",
     "run_files/sealed_stream.py", "recorder/recorder.py",
-    "run_files/column_file.py", "run_files/table_store/disk.py", "run_files/table_store/part_writer.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
+    "run_files/table_store/disk.py", "run_files/table_store/part_writer.py",
+    "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
     "run_files/latched_fault.py", "run_files/disk_budget.py", "control_port/sockets.py",
