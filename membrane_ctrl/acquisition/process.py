@@ -22,8 +22,8 @@ from membrane_ctrl.processes import child, ring
 # Limits this process's numerical threads: the control process's tick needs a core.
 
 
-# The kernels use two threads of their own (metrology.threads). Linear algebra is 36 x 36 here: more than one thread
-# would only spin.
+# The kernels use two threads of their own (metrology.threads). Matrices are small here, terms x terms: more than one
+# thread would only spin.
 _LIMITS = {
     "NUMBA_NUM_THREADS": "2",
     "OMP_NUM_THREADS": "1",

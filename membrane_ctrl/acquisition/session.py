@@ -62,7 +62,7 @@ class _StandingFilm:
 # A real film's sag is unknown before the measurement; a metre of film at the usual pressure has this one
 TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
 
-_SMALL_PX = 300  # still enough points for 36 terms, at a hundredth of the work
+_SMALL_PX = 300  # still enough points for the fit of the terms, at a hundredth of the work
 
 
 def small(optics: OpticsConfig) -> OpticsConfig:

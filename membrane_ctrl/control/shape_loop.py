@@ -93,10 +93,10 @@ class SagChange:
 def sag_change(
     coeffs_um: FloatArray, reference_um: FloatArray, covariance_um2: FloatArray, sensitivity: FloatArray
 ) -> SagChange:
-    """Sag now minus sag at the reference, from coefficients (36,) and their covariance (36, 36).
+    """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms, terms).
 
-    The reference is constant, hence no noise of the change. `sensitivity` (36,) is the coefficients' change per um of
-    sag.
+    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the coefficients' change per um
+    of sag.
     """
     s = sensitivity[MEASURED]
     covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)

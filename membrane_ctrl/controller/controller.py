@@ -43,7 +43,8 @@ _NO_DIGITS = str.maketrans("", "", "0123456789")
 class Controller:
     """Owns the state machine, the safety table and both loops.
 
-    `sag_sensitivity` (36,) are the Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape loop.
+    `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape
+    loop.
     """
 
     def __init__(self, config: Config, sag_sensitivity: arrays.FloatArray) -> None:

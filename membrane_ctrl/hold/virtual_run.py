@@ -66,7 +66,7 @@ class VirtualRun:
     config : Config
     bench : VirtualBench
         Plant, board, and their faults.
-    sag_sensitivity : (36,) array
+    sag_sensitivity : (terms,) array
         See `Controller`.
     shape : callable, optional
         Called with the time every `shape.period_s`; returns an estimate or None.

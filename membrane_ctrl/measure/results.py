@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
 
 @dataclass(frozen=True)
 class ErrorBars:
-    """The budget of a measurement; covariances (36, 36) of the fit's parameters, mm^2."""
+    """The budget of a measurement; covariances (parameters, parameters) of the fit's parameters, mm^2."""
 
     budget: Budget
     source: str  # source of the geometry's covariance

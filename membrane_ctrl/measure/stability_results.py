@@ -26,7 +26,7 @@ def series_head(points: Iterable[str]) -> tuple[str, ...]:
 
 
 def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read times (n,), point heights (n, points) and coefficients (n, 36) of the sets with a figure.
+    """Read times (n,), point heights (n, points) and coefficients (n, terms) of the sets with a figure.
 
     At most about `most` of them, evenly spaced, however long the run.
     """
@@ -80,7 +80,7 @@ def draw_stability(
 
 
 def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
-    """Draw the terms' changes (sets, 36) from their means: the eight that move most, by Noll index."""
+    """Draw the terms' changes (sets, terms) from their means: the eight that move most, by Noll index."""
     change = coeffs_um - coeffs_um.mean(axis=0)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()
@@ -115,7 +115,7 @@ def log_stability(
 
     Parameters
     ----------
-    heights_um, coeffs_um : (n, points), (n, 36) arrays
+    heights_um, coeffs_um : (n, points), (n, terms) arrays
         Shown relative to their means, without piston.
     sd_um : (m, m) array
         Map of standard deviations, rows along y, NaN outside.

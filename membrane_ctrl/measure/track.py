@@ -142,7 +142,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
 def _measured(reference: SetFigure) -> BinFigure:
     """The reference's bins on the surface that `measure` gives: its weights differ from those of the bins' own fit.
 
-    Where the film is none of 36 terms, the two differ by more than the error bar of a frame.
+    Where the terms cannot represent the film, the two differ by more than the error bar of a frame.
     """
     optics, checked = reference.head.optics, reference.checked
     found = reconstruct_full(optics, checked, measure_pixels(optics, checked)).fit

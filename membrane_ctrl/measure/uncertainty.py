@@ -38,7 +38,7 @@ def run_everywhere(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
+    """Parameters (trials, sets, parameters) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
 
     `workers` is the number of processes, by default according to the work; `scheduler` the address of a Dask
     scheduler to use instead, e.g. tcp://host:8786. Raises InputError if Dask is not installed or the spread is too
@@ -74,7 +74,8 @@ class UncertaintyOptions:
 class Spread:
     """Spread of the height of a set, or of its change since another."""
 
-    # (36, 36) each, of the parameters in mm^2: over the trials, from the Jacobian and the noise, from the noise alone
+    # (parameters, parameters) each, of the parameters in mm^2: over the trials, from the Jacobian and the noise, from
+    # the noise alone
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray
@@ -108,7 +109,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
 
 
 def _budget(folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the only set by its budget, or of the change since the second."""
+    """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change since the second."""
     budgets = []
     for folder in folders:
         measured = measure_set(folder, given)

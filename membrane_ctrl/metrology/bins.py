@@ -110,7 +110,7 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
 
 
 def parameter_covariance(normal: NormalMatrix, slope_variance: FloatArray) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the fit's parameters, for the variance (2,) of an x and of a y slope."""
+    """Covariance (parameters, parameters) in mm^2 of the fit, for the variance (2,) of an x and of a y slope."""
     variance_x, variance_y = slope_variance
     return np.asarray(normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse)
 

@@ -83,7 +83,7 @@ class UnseenMotion:
 def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
     """Ask the fringes whether the film moved between the x and the y frames.
 
-    Slopes in x of one bowl and slopes in y of another do not integrate to a surface. Least squares over the 36
+    Slopes in x of one bowl and slopes in y of another do not integrate to a surface. Least squares over the
     parameters, all inputs of the geometry with their prior, and the motion: what they cannot explain, it does.
     """
     nominal = bench.geometry()
@@ -152,7 +152,7 @@ def rim_widening(bench: TrialBench, spread: GeometrySpread, outline: Outline | N
 
 @cache
 def _alike() -> FloatArray:
-    """(36, k) parameters of the surfaces most like the round terms beyond the 36, with their sag."""
+    """(parameters, k) parameters of the surfaces most like the round terms beyond the fit's, with their sag."""
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
     inside = np.hypot(x, y) <= 1
     rows, (heights, _, _) = residuals.basis(x[inside], y[inside])[0].T, residuals.round_basis(x[inside], y[inside])
@@ -164,11 +164,12 @@ def _alike() -> FloatArray:
 def law_effect(
     patches: budget.Patches, radius_mm: float, inverse: FloatArray, slope_variance: float = 0.0
 ) -> tuple[FloatArray, float]:
-    """(36,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its residual slopes show it.
+    """(parameters,) error of the parameters, in mm, for a film whose bowl is not Hencky's, as its residual slopes
+    show it.
 
     The second answer is what noise of the points' slopes adds to its square.
 
-    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the 36 terms and the excess.
+    Pre-strain, another Poisson ratio or a ring's moment bend the round profile beyond the terms and the excess.
     Least squares take some of that for other terms, and the rest is missing from the sag.
     """
     x, y = patches.places_mm / radius_mm

@@ -222,7 +222,7 @@ def figure_bars(
     ----------
     disc_mm : float
         Radius of the fit's Zernike disc.
-    covariance_mm2 : (36, 36) array
+    covariance_mm2 : (parameters, parameters) array
         Covariance of the fit's parameters, in mm^2. Not finite: no error bar, all NaN.
     cell_slope : float
         1 sigma of the mean slope of a cell by white noise.
@@ -292,7 +292,7 @@ class PowerSpectrum:
 def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> PowerSpectrum:
     """Spectrum of the deviation from the best sphere under a radial Hann window.
 
-    Cells without a measurement are filled by the fit of 36 terms.
+    Cells without a measurement are filled by the fit of the terms.
     """
     x, y = np.meshgrid(axis_mm, axis_mm)
     r, step = np.hypot(x, y), float(axis_mm[1] - axis_mm[0])

@@ -1,8 +1,9 @@
 """The film's material from figures at several pressures: pre-strain, Poisson ratio, stiffness, and the ring's form.
 
-Each figure gives four rotationally symmetric numbers: Noll 4, 11, 22 and the excess. The law (`film_law`) predicts
-them from the pre-strain, the Poisson ratio and the set's own load q; the gauge says q = p a / (E t). Terms with
-azimuthal order 1 to 3 belong to the ring: a pre-strain that varies, a ring that is not flat or not round.
+Each figure gives its rotationally symmetric numbers: with 36 terms Noll 4, 11, 22 and the excess. The law
+(`film_law`) predicts them from the pre-strain, the Poisson ratio and the set's own load q; the gauge says q = p a /
+(E t). Terms with azimuthal order 1 to 3 belong to the ring: a pre-strain that varies, a ring that is not flat or not
+round.
 
 No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows with a power of the
 sag; both are taken from what the law leaves, here and in the terms that it says nothing about, and all results are
@@ -44,9 +45,9 @@ class FilmFigure:
     """One set's figure."""
 
     name: str
-    parameters_mm: FloatArray  # (36,), as of `Surface.parameters`
-    noise_mm2: FloatArray  # (36, 36): covariance from the pixels' noise
-    geometry_mm: FloatArray  # (36, k): change with each independent error of the geometry by its sigma
+    parameters_mm: FloatArray  # (parameters,), as of `Surface.parameters`
+    noise_mm2: FloatArray  # (parameters, parameters): covariance from the pixels' noise
+    geometry_mm: FloatArray  # (parameters, k): change with each independent error of the geometry by its sigma
     pressure_pa: float  # NaN without a gauge
     sag_mm: float
 
@@ -81,7 +82,7 @@ class FilmFit:
 
     law: FilmLaw  # its stiffness is meaningless without pressures
     covariance: FloatArray  # (3, 3): of pre-strain, Poisson ratio, relative stiffness
-    left_mm: FloatArray  # (n, 36): what it leaves; 0 where it says nothing (tilt, orders above 3)
+    left_mm: FloatArray  # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 3)
     waves: tuple[RingWave, ...]
     misfit_um: float  # 1 sigma of a term
 
@@ -121,7 +122,7 @@ def _seen_mm(figures: Sequence[FilmFigure]) -> float:
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
-    """Noll 4, 11, 22 and the excess, (n, 4), that a fit of slopes inside `reach` radii finds in bowls (n, 1)."""
+    """The round terms and the excess (n, k) that a fit of slopes inside `reach` radii finds in bowls (n, 1)."""
     rho, weight, onto = _round_projection(reach)
     return np.asarray(bowls.rise_mm(rho) * weight @ onto.T)
 
@@ -135,7 +136,7 @@ def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
 
 @cache
 def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Radii, weights, and the least squares of slopes there onto the four terms."""
+    """Radii, weights, and the least squares of slopes there onto these terms."""
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
     round_degrees = [*enumerate(np.eye(film_law.EXCESS_DEGREE))][1:]
@@ -303,7 +304,7 @@ def _terms(order: int) -> IntArray:
 def _fit_ring(
     figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm: float
 ) -> tuple[tuple[RingWave, ...], FloatArray]:
-    """Waves of the ring, and what they add to the figures' parameters (n, 36)."""
+    """Waves of the ring, and what they add to the figures' parameters (n, parameters)."""
     added = np.zeros((len(figures), ZERNIKE_TERMS))
     waves = []
     alike = _alike(figures)

@@ -33,7 +33,8 @@ _NO_SLOPE = 4e-3
 class FullResult:
     """Everything of one set."""
 
-    fit: reconstruct.Fit  # the surface: Hencky excess and 36 terms; `changes_mm` of all iterations from the start
+    # the surface: Hencky excess and Zernike terms; `changes_mm` of all iterations from the start
+    fit: reconstruct.Fit
     index: IntArray  # (n,): pixels inside the analysis radius that gave slopes, counted row by row
     weights: FloatArray  # (n,): weight in the fit
     swing_adu: Singles  # (n,): the smaller of the two fringe amplitudes
@@ -251,15 +252,15 @@ def _quality(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing
     )
 
 
-# The figure of a checked set from its bins, for the analysis of many sets: for 36 terms the bins carry as much as the
-# pixels, at a sixteenth of the cost (decision 41).
+# The figure of a checked set from its bins, for the analysis of many sets: for Zernike terms the bins carry as much
+# as the pixels, at a sixteenth of the cost (decision 41).
 
 
 @dataclass(frozen=True)
 class BinFigure:
     """Surface through the bins of one set."""
 
-    fit: reconstruct.Fit  # Hencky excess and 36 terms
+    fit: reconstruct.Fit  # Hencky excess and Zernike terms
     points: reconstruct.Points  # the bins' rays and screen points, standing on the surface
     index: IntArray  # (n,): their bins
     sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels

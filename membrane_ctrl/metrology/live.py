@@ -154,7 +154,7 @@ class LiveReconstructor:
 
     @property
     def common_covariance_um2(self) -> FloatArray:
-        """Covariance (36, 36) of the coefficients from what all cycles share: geometry, lens, screen, air, blur.
+        """Covariance (terms, terms) of the coefficients that all cycles share: geometry, lens, screen, air, blur.
 
         Add it to a cycle's own for a single figure, not for changes. NaN before the first full cycle and without a
         spread.
@@ -163,7 +163,7 @@ class LiveReconstructor:
         return np.asarray(1e6 * to_coeffs @ self._watch.common_mm2 @ to_coeffs.T)
 
     def sag_sensitivity(self) -> FloatArray:
-        """Change of the 36 coefficients (um) per um of sag of a Hencky bowl."""
+        """Change of the coefficients (terms,) in um per um of sag of a Hencky bowl."""
         return film_law.zernike_projection().copy()
 
     def _tracer(self, readings_um: FloatArray) -> reconstruct.Tracer:

@@ -75,7 +75,7 @@ def sensitivity_mm_per_um(
 
 _START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
 _OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
-_MIN_POINTS = 1000  # far more than 36 unknowns, far fewer than any real view of the mirror
+_MIN_POINTS = 1000  # far more than the unknowns, far fewer than any real view of the mirror
 
 
 @dataclass

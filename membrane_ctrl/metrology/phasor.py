@@ -1,8 +1,8 @@
 """Sums of pixels over square bins, and the phase of the bins against a reference: the fast path of a cycle.
 
 The phasor of a bin is linear in the frames, so the frames are summed over each bin first, each read once and in
-the order of its memory; the phase steps are then combined on 1/16 of the numbers. For surfaces of 36 terms nothing
-is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phasor and leaves its phase.
+the order of its memory; the phase steps are then combined on 1/16 of the numbers. For surfaces of Zernike terms
+nothing is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phasor and leaves its phase.
 """
 
 import math

@@ -23,9 +23,9 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 # Normal equations of the slope fit, made from moments (the paper's eqs. for D, G and A).
 #
 # With D the derivatives of the basis at the points and g the measured slopes, A = (D^T D)^-1 D^T g. All derivatives
-# of the 36 Zernike terms are polynomials of degree 6 in x and y, so D^T g and D^T D follow exactly from sums of
-# monomials over the points; no 2N x 36 matrix is ever built. As printed, D^T D is singular: piston has no slope. Here
-# the Hencky excess replaces piston's column, scaled to unit RMS like the others.
+# of the Zernike terms are polynomials of one degree less in x and y, so D^T g and D^T D follow exactly from sums of
+# monomials over the points; no matrix of 2N rows is ever built. As printed, D^T D is singular: piston has no slope.
+# Here the Hencky excess replaces piston's column, scaled to unit RMS like the others.
 
 _M = kernels.SLOPE_MONOMIALS
 _POWERS = [(p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)]  # in the kernels' order
@@ -34,7 +34,8 @@ _PRODUCT_POWERS = [(p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in ra
 
 @cache
 def slope_tables() -> tuple[FloatArray, FloatArray]:
-    """dZ_j/dx and dZ_j/dy for j = 2..36 as monomial coefficients, (35, 28) each, on the unit disc."""
+    """dZ_j/dx and dZ_j/dy for j = 2, 3, ... as monomial coefficients, (terms - 1, SLOPE_MONOMIALS) each, on the unit
+    disc."""
     rows, columns = np.array(_POWERS).T
     tables = [zernike.differentiate(zernike.monomial_table(), axis)[1:, rows, columns] for axis in (1, 2)]
     return tables[0], tables[1]
@@ -42,7 +43,7 @@ def slope_tables() -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _product_index() -> IntArray:
-    """Index of the product of monomials k and l among the product moments, (28, 28)."""
+    """Index of the product of monomials k and l among the product moments, a square matrix."""
     place = {power: k for k, power in enumerate(_PRODUCT_POWERS)}
     return np.array([[place[a[0] + b[0], a[1] + b[1]] for b in _POWERS] for a in _POWERS])
 
@@ -51,9 +52,10 @@ def _product_index() -> IntArray:
 class NormalMatrix:
     """D^T W D, apart for x and y slopes, and its inverse."""
 
-    x: FloatArray  # (36, 36): shares of the x and of the y slopes, in 1/mm^2 times weight
-    y: FloatArray  # (36, 36)
-    # (36, 36), of their sum; the condition number is below 1000, and the next step corrects what rounding leaves
+    x: FloatArray  # (parameters, parameters): shares of the x and of the y slopes, in 1/mm^2 times weight
+    y: FloatArray  # (parameters, parameters)
+    # (parameters, parameters), of their sum; the condition number is below 1000, and the next step corrects what
+    # rounding leaves
     inverse: FloatArray
 
     @classmethod
@@ -62,7 +64,7 @@ class NormalMatrix:
         x, y = _assemble(products, radius_mm)
         inverse = x + y
         if not kernels.invert(inverse):
-            raise ValueError("the measured points do not determine the 36 parameters of the surface")
+            raise ValueError(f"the measured points do not determine the {PARAMETERS} parameters of the surface")
         return cls(x, y, inverse)
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -86,7 +88,7 @@ def _assemble(products: FloatArray, radius_mm: float) -> tuple[FloatArray, Float
 
 
 def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
-    """D^T W r of the x and of the y slopes, (2, 36), from the moments of `kernels.residual_sums`."""
+    """D^T W r of the x and of the y slopes, (2, parameters), from the moments of `kernels.residual_sums`."""
     out = np.empty((2, PARAMETERS))
     for axis, table in enumerate(slope_tables()):
         out[axis, :-1] = table @ sums[axis * _M : (axis + 1) * _M]

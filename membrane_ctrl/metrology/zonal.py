@@ -1,4 +1,4 @@
-"""The zonal map: what the 36 terms cannot represent, integrated from the slopes' residual to the fit.
+"""The zonal map: what the terms cannot represent, integrated from the slopes' residual to the fit.
 
 Only the residual is integrated, so that neither the grid's step nor its interpolation touches the millimetres of the
 bowl. Slopes scattered over the mirror are averaged in cells; two neighbouring cells see the height change by the mean
@@ -183,7 +183,7 @@ class ResidualGrid:
         """1 sigma of the integrated height when the cells' slopes have this white noise.
 
         The height's density over the plane of waves k is (slope step / k)^2, from the fastest that the grid holds to
-        the slowest that the fit of 36 terms leaves.
+        the slowest that the fit of the terms leaves.
         """
         fastest, slowest = 2 * math.sqrt(math.pi) / self.step_mm, math.pi * FIT_CYCLES / float(self.axis_mm[-1])
         return cell_slope * self.step_mm * math.sqrt(max(math.log(fastest / slowest), 0.0) / (2 * math.pi))

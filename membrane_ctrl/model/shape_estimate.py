@@ -30,11 +30,11 @@ class ShapeEstimate:
     # "full" (Gray codes taken), "fringes" (fringe orders carried over from the last absolute phase) or "track" (one
     # frame of crossed fringes)
     kind: Kind
-    # (36,) Noll j = 1..36, orthonormal over `mirror.radius_mm`, of the height; piston makes it 0 at the vertex
+    # (terms,) in Noll's order, orthonormal over `mirror.radius_mm`, of the height; piston makes it 0 at the vertex
     coeffs_um: FloatArray
-    # amplitude of the part of a Hencky bowl that the 36 terms cannot represent, as the sag of that bowl
+    # amplitude of the part of a Hencky bowl that the terms cannot represent, as the sag of that bowl
     hencky_um: float
-    # (36, 36) of `coeffs_um`, for changes: what this cycle does not share with others near its displacement
+    # (terms, terms) of `coeffs_um`, for changes: what this cycle does not share with others near its displacement
     covariance_um2: FloatArray
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
     sag_sigma_um: float  # its standard deviation from `covariance_um2`
@@ -73,12 +73,12 @@ def pack_estimate(estimate: ShapeEstimate) -> bytes:
 
 
 def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
-    """(666,) float32: the upper half of a symmetric (36, 36) matrix, row by row."""
+    """(COVARIANCE_UPPER_SIZE,) float32: the upper half of a symmetric (terms, terms) matrix, row by row."""
     return ((covariance_um2 + covariance_um2.T) / 2)[_UPPER].astype("<f4")
 
 
 def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
-    """Bytes of an estimate's numbers and words, (36,) coefficients and (666,) upper half."""
+    """Bytes of an estimate's numbers and words, coefficients (terms,) and upper half (COVARIANCE_UPPER_SIZE,)."""
     line = json.dumps({**head, "terms": ZERNIKE_TERMS, "symmetric": True, "single": True}, default=float)
     arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
     return line.encode() + b"\n" + arrays

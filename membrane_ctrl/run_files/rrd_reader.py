@@ -58,7 +58,7 @@ def read_ticks(path: Path, names: Sequence[str], notes: list[str]) -> dict[str, 
 
 
 def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
-    """Read one segment's shape estimates: `time_s`, `coeffs_um` (n, 36), changes of sag and laser, quality."""
+    """Read one segment's shape estimates: `time_s`, `coeffs_um` (n, terms), changes of sag and laser, quality."""
     found = _scalars(path, {stream.path for stream in (*streams.SHAPE_STREAMS, streams.SAG)}, notes)
     if streams.ZERNIKE.path not in found:
         return {}

@@ -121,7 +121,7 @@ class Run:
         return streams.named_table(level, self.origin_utc)
 
     def cycles(self, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
-        """The measured figure, one row per cycle: times, `z1_um` to `z36_um`, sag, quality, verdict."""
+        """The measured figure, one row per cycle: times, `z1_um` and all other terms, sag, quality, verdict."""
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
         return streams.named_table(found.select(wanted).columns(), self.origin_utc)

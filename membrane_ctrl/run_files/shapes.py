@@ -25,11 +25,11 @@ class Shapes:
     ----------
     time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s, hencky_um : array
         As in `ShapeEstimate`.
-    coeffs_um : (n, 36) array
+    coeffs_um : (n, terms) array
     verdict : (n,) array of str
     covariance_time_s : (k,) array
         Times of the cycles with a recorded covariance.
-    covariance_um2 : (k, 36, 36) array
+    covariance_um2 : (k, terms, terms) array
     """
 
     time_s: Column
@@ -51,12 +51,12 @@ class Shapes:
     def select(self, wanted: NDArray[np.bool_]) -> Shapes:
         """The cycles for which `wanted` (n,) is true, with all covariances."""
         if wanted.all():
-            return self  # a month of coefficients is 190 MB
+            return self  # a month of 36 coefficients is 190 MB
         parts = {name: getattr(self, name)[wanted] for name in (*NUMBERS, "coeffs_um", "verdict")}
         return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
 
     def columns(self) -> dict[str, Column | NDArray[np.str_]]:
-        """Columns of a table with one row per cycle: time, Z1..Z36, sag, quality, verdict."""
+        """Columns of a table with one row per cycle: time, terms from Z1, sag, quality, verdict."""
         coeffs = dict(zip(zernike_columns(), np.ascontiguousarray(self.coeffs_um.T), strict=True))
         numbers = {name: getattr(self, name) for name in NUMBERS}
         return {"time_s": self.time_s} | coeffs | numbers | {"verdict": self.verdict}
@@ -66,11 +66,11 @@ class Shapes:
         return self.parameters_um() @ height_basis(x, y)
 
     def parameters_um(self) -> Column:
-        """(n, 37): the 36 coefficients and the amplitude of the additional Hencky part."""
+        """(n, terms + 1): the coefficients and the amplitude of the additional Hencky part."""
         return np.column_stack((self.coeffs_um, self.hencky_um))
 
     def covariance_near(self, time_s: float) -> Column | None:
-        """Covariance (36, 36) in um^2 recorded nearest to a time; None if there is none."""
+        """Covariance (terms, terms) in um^2 recorded nearest to a time; None if there is none."""
         if not self.covariance_time_s.size:
             return None
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
@@ -83,7 +83,7 @@ NUMBERS = (
 
 
 def height_basis(x: Column, y: Column) -> Column:
-    """(37, points): height above the vertex per unit of each parameter."""
+    """(terms + 1, points): height above the vertex per unit of each parameter."""
     units = np.eye(ZERNIKE_TERMS + 1)
     return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
 
@@ -166,7 +166,7 @@ def _matrix(cells: pa.Array, count: int) -> Column:
 
 
 def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
-    """Rows with a covariance, and the (k, 36, 36) matrices."""
+    """Rows with a covariance, and the (k, terms, terms) matrices."""
     if "covariance_um2" not in table.column_names:
         return np.empty(0, dtype=np.int64), np.empty((0, ZERNIKE_TERMS, ZERNIKE_TERMS))
     cells = table.column("covariance_um2").combine_chunks()
@@ -191,7 +191,7 @@ MAPS = {
 
 Map = NDArray[np.float32]
 
-MAP_PX = 96  # resolves all 36 terms (radial order 7)
+MAP_PX = 96  # far finer than what the terms can change over
 
 
 def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
@@ -212,12 +212,12 @@ def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_e
 
 
 def change_map_um(parameters_um: Column) -> Map:
-    """Height of a change of the 37 parameters (`Shapes.parameters_um`), um, as `height_map_mm`."""
+    """Height of a change of the parameters (`Shapes.parameters_um`), um, as `height_map_mm`."""
     return _spread(parameters_um @ _basis())
 
 
 def deviation_map_um(parameters_um: Column) -> Map:
-    """Standard deviation of the height over at least two cycles with (n, 37) parameters, um."""
+    """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters, um."""
     variance = np.einsum("jp,jp->p", _basis(), np.cov(parameters_um.T) @ _basis())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -236,7 +236,7 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
 
 
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
-    """Standard deviation of the height, um: sqrt of z C z' with the row z of the 36 terms at each point."""
+    """Standard deviation of the height, um: sqrt of z C z' with the row z of the terms at each point."""
     variance = np.einsum("jp,jp->p", _terms(), covariance_um2 @ _terms())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -250,7 +250,7 @@ class Scatter:
         self._squares = np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS))
 
     def add(self, coeffs_um: NDArray[np.float64]) -> None:
-        """Add (36,) coefficients."""
+        """Add (terms,) coefficients."""
         self.count += 1
         off = coeffs_um - self._mean
         self._mean = self._mean + off / self.count
@@ -279,7 +279,7 @@ def _spread(values: NDArray[np.float64]) -> Map:
 
 @cache
 def _basis() -> NDArray[np.float64]:
-    """(37, points) height per unit of each parameter."""
+    """(terms + 1, points) height per unit of each parameter."""
     return height_basis(*_points())
 
 
@@ -297,7 +297,7 @@ def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 @cache
 def _terms() -> NDArray[np.float64]:
-    """(36, points) the Zernike terms."""
+    """(terms, points) the Zernike terms."""
     return zernike.values(*_points())
 
 

@@ -89,8 +89,8 @@ _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 class ShapeLoopFit:
     """Result of the fit."""
 
-    sensitivity: Series  # (36,): change of the coefficients per um of sag, and standard errors
-    sensitivity_sigma: Series  # (36,)
+    sensitivity: Series  # (terms,): change of the coefficients per um of sag, and standard errors
+    sensitivity_sigma: Series  # (terms,)
     agreement: float  # cosine between it and the one assumed, piston left out; 1 is the same direction
     scale: float  # sag by deflectometry per um of laser reading
     sigma_um: float  # noise of a cycle
@@ -126,7 +126,7 @@ def evaluate(
 ) -> ShapeLoopFit:
     """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a steady hold.
 
-    `assumed` (36,) is the controller's sensitivity. Raises ValueError if there are too few shapes.
+    `assumed` (terms,) is the controller's sensitivity. Raises ValueError if there are too few shapes.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]

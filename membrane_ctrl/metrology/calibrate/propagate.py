@@ -25,18 +25,18 @@ class Propagated:
     height_rms_um: float  # over the analysed disc; the figure is the height without its best plane
     figure_rms_um: float
     sag_um: float  # of the rim above the vertex
-    zernike_um: FloatArray  # (36,): Noll j = 1..36; 2 and 3 are the tilt
+    zernike_um: FloatArray  # (terms,) in Noll's order; 2 and 3 are the tilt
 
 
 def surface_response(solution: Solution, index: int) -> FloatArray:
-    """d surface / d (optical parameters, vertex' height), (36, OPTICAL + 1), of one set."""
+    """d surface / d (optical parameters, vertex' height), (parameters, OPTICAL + 1), of one set."""
     sums = solution.equations[index].sums
     order = [*range(residuals.LOCAL, residuals.LOCAL + parameters.OPTICAL), PARAMETERS]
     return np.asarray(-np.linalg.solve(sums[:PARAMETERS, :PARAMETERS], sums[:PARAMETERS, order]))
 
 
 def surface_covariance(solution: Solution, index: int) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the parameters of one set's surface."""
+    """Covariance (parameters, parameters) in mm^2 of the parameters of one set's surface."""
     response = surface_response(solution, index)
     geometry = solution.covariance[: parameters.OPTICAL, : parameters.OPTICAL]
     vertex = response[:, -1] * solution.problem.references.laser_sigma_um * 1e-3
@@ -58,12 +58,12 @@ def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Prop
 
 
 def sag_um(covariance: FloatArray) -> float:
-    """Standard deviation of the sag from a covariance (36, 36) in mm^2 of a surface's parameters."""
+    """Standard deviation of the sag from a covariance (parameters, parameters) in mm^2 of a surface's parameters."""
     return 1e3 * float(np.sqrt(sag_gradient() @ covariance @ sag_gradient()))
 
 
 def disc(radius: float) -> tuple[FloatArray, FloatArray]:
-    """Heights (n, 36) of the surface's parameters over a disc of some radii, and the plane's columns (n, 3)."""
+    """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n, 3)."""
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-radius, radius, 41)] * 2))
     inside = np.hypot(x, y) <= radius
     x, y = x[inside], y[inside]

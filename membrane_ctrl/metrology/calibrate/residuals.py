@@ -36,8 +36,8 @@ from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-# of one set: its surface's 36, the height of its vertex, its round terms beyond the 36, and by how much the film was
-# deeper in the x frames than in the y frames
+# of one set: its surface's parameters, the height of its vertex, its round terms beyond them, and by how much the
+# film was deeper in the x frames than in the y frames
 BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(film_law.BEYOND))
 MOTION = BEYOND.stop
 LOCAL = MOTION + 1
@@ -307,12 +307,12 @@ def deeper(by_motion: FloatArray) -> FloatArray:
 
 @cache
 def _deeper() -> FloatArray:
-    """Change (36,) of the surface's parameters by 1 mm of sag; the vertex goes down by as much."""
+    """Change (parameters,) of the surface's parameters by 1 mm of sag; the vertex goes down by as much."""
     return Surface.hencky_bowl(1.0, 1.0).parameters
 
 
 def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (36, n) of the surface's parameters in radii, each 0 at the vertex."""
+    """Heights and slopes (parameters, n) of the surface's parameters in radii, each 0 at the vertex."""
     v = x * x + y * y
     excess = film_law.excess() / film_law.excess_rms()
     bowl = series.polyval(v, excess) - excess[0]
@@ -332,7 +332,7 @@ def round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, F
 
 
 def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
-    """x^p y^q, p + q <= 7, p outer, (36, n)."""
+    """x^p y^q, p + q <= ZERNIKE_DEGREE, p outer, (terms, n)."""
     out, column = [], np.ones_like(x)
     for p in range(ZERNIKE_DEGREE + 1):
         term = column
@@ -345,7 +345,7 @@ def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
 
 @cache
 def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Z_j, dZ_j/dx and dZ_j/dy, j = 2..36, as coefficients (35, 36) of `_monomials`."""
+    """Z_j, dZ_j/dx and dZ_j/dy, j = 2, 3, ..., as coefficients (terms - 1, terms) of `_monomials`."""
     p, q = np.array([(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]).T
     table = zernike.monomial_table()
     height, of_x, of_y = (t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2))))

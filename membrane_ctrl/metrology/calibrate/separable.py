@@ -1,9 +1,9 @@
 """Normal equations of one set, with its surface eliminated (variable projection).
 
-The unknowns of set i are its surface q_i (36) and the height z_i of its vertex; those of all sets are the geometry's
-parameters, the ring's form and the laser's scale. The Schur complement over (q_i, z_i) leaves a matrix of the common
-unknowns alone. These matrices add, so that the cost grows with the number of sets and not with its cube, and any
-subset of the sets, and any choice of free parameters, can be solved again without another look at the points.
+The unknowns of set i are its surface q_i (parameters,) and the height z_i of its vertex; those of all sets are the
+geometry's parameters, the ring's form and the laser's scale. The Schur complement over (q_i, z_i) leaves a matrix of
+the common unknowns alone. These matrices add, so that the cost grows with the number of sets and not with its cube,
+and any subset of the sets, and any choice of free parameters, can be solved again without another look at the points.
 
 Each set adds two more observations to the same matrix. The ring does not move: the harmonics 0..7 of the height of
 the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The laser gives the
@@ -23,11 +23,11 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScr
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-RING = 2 * ZERNIKE_DEGREE + 1  # harmonics of the rim: a constant, seven cosines, seven sines
+RING = 2 * ZERNIKE_DEGREE + 1  # harmonics of the rim: a constant, cosines and sines up to the degree
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
-# The film as a check of the geometry. Its round terms beyond the 36 are a micrometre of a 37 mm bowl, and a nanometre
-# of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever slackness
-# the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
+# The film as a check of the geometry. Its round terms beyond the fit's are a micrometre of a 37 mm bowl, and a
+# nanometre of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever
+# slackness the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
 _TILT_STEP = 1e-4
@@ -55,7 +55,7 @@ class References:
     laser_sigma_um: float = 1.0  # of a set's mean reading
     # the clamp creeps by less than a micrometre in the minutes that a calibration takes
     ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
-    film: FilmModel = "free"  # what the film's round terms beyond the 36 are
+    film: FilmModel = "free"  # what the film's round terms beyond the fit's are
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def _reference_rows(
 
 
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
-    """What the film says of the terms beyond the 36, as weighted rows [derivatives, miss]."""
+    """What the film says of the terms beyond the fit's, as weighted rows [derivatives, miss]."""
     rows = np.zeros((len(film_law.BEYOND), residuals.LOCAL + COMMON + 1))
     rows[:, residuals.BEYOND] = np.eye(len(film_law.BEYOND))
     rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * len(film_law.BEYOND))
@@ -289,13 +289,13 @@ def rim_of(state: SetState) -> FloatArray:
 
 @cache
 def _rim_beyond() -> FloatArray:
-    """Height of the rim above the vertex by the round terms beyond the 36."""
+    """Height of the rim above the vertex by the round terms beyond the fit's."""
     return np.asarray(film_law.beyond().sum(axis=1))
 
 
 @cache
 def rim_harmonics() -> FloatArray:
-    """Matrix (RING, 36) from the surface's parameters to the harmonics of the rim's height above the vertex."""
+    """Matrix (RING, parameters) from a surface to the harmonics of its rim's height above the vertex."""
     theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
     heights = residuals.basis(np.cos(theta), np.sin(theta))[0]
     orders = np.outer(np.arange(1, ZERNIKE_DEGREE + 1), theta)

@@ -19,7 +19,7 @@ from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
-_LEAST_BANDS = 4  # in the picture: maps of 36 terms follow wider ones
+_LEAST_BANDS = 4  # in the picture: maps of the terms follow wider ones
 # Power over the median around it and of all, of one frame and of the mean over some. Without bands it reaches 22 in a
 # thousand frames. Of bands as wide as the fringes a fit leaves little: 100 where figures were 13 sigma off.
 _CLEAR, _CLEAR_MEAN = 30.0, 25.0

@@ -11,7 +11,7 @@ from membrane_ctrl.metrology.phase import AXES, step_design, step_weights
 from membrane_ctrl.metrology.phasor import Binner, StepCombination, arctan2, still
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
-_ENOUGH_BINS = 50_000  # for 36 terms and for the checks of the frames; more only cost time
+_ENOUGH_BINS = 50_000  # for the terms and for the checks of the frames; more only cost time
 _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
 
 

@@ -306,7 +306,7 @@ def legendre_series(bowl: Bowl, degree: int) -> Legendre:
 
 @cache
 def zernike_projection() -> FloatArray:
-    """Noll coefficients (36,) of a Hencky bowl of unit sag; also their change per unit of sag."""
+    """Noll coefficients (terms,) of a Hencky bowl of unit sag; also their change per unit of sag."""
     out = np.zeros(ZERNIKE_TERMS)
     for degree, j in enumerate(ROUND_NOLL):
         out[j - 1] = profile_legendre().coef[degree] / np.sqrt(2 * degree + 1)
@@ -316,7 +316,7 @@ def zernike_projection() -> FloatArray:
 
 @cache
 def excess() -> FloatArray:
-    """Power series in v of the part of a bowl of unit sag that the 36 terms cannot represent."""
+    """Power series in v of the part of a bowl of unit sag that the terms cannot represent."""
     coef = profile_legendre().coef.copy()
     coef[:EXCESS_DEGREE] = 0.0
     out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef
@@ -330,7 +330,7 @@ BEYOND = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
 
 @cache
 def beyond() -> FloatArray:
-    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the 36, each 0 at the vertex."""
+    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the fit's, each 0 at the vertex."""
     out = np.zeros((len(BEYOND), EXCESS_TERMS))
     for row, degree in zip(out, BEYOND, strict=True):
         power = np.sqrt(2 * degree + 1) * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef

@@ -6,8 +6,8 @@ on a range of them, so that threads can share them.
 
 Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface (updated in place
 by Newton steps), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of the screen, `face` the `Face` that
-deviates from it, `poly` (8, 8) the Zernike part, `excess` (15,) the Hencky excess of unit RMS and `amplitude` its
-size.
+deviates from it, `poly` (degree + 1, degree + 1) the Zernike part, `excess` (15,) the Hencky excess of unit RMS and
+`amplitude` its size.
 """
 
 import math
@@ -21,10 +21,10 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 FACE_STEPS = 6  # see `_onto_face`
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
 
-SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q <= 6: 28
+SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q < degree
 SUMS = 2 * SLOPE_MONOMIALS + 5  # moments of r_x and of r_y, two for the excess, sum w r_x^2, sum w r_y^2, sum w
 PRODUCT_DEGREE = 2 * (ZERNIKE_DEGREE - 1)
-PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <= 12: 91
+PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <= PRODUCT_DEGREE
 PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
 
@@ -155,8 +155,8 @@ def _powers(y, powers_y, count):  # type: ignore[no-untyped-def]
 def residual_sums(rays, t, screen, weights, pinhole, plane, face, poly, excess, amplitude, radius, start, stop):  # type: ignore[no-untyped-def]
     """Moments of the weighted slope residual g - D a: all that the right-hand side of the least squares needs.
 
-    Returns (SUMS,): sum w r_x x^p y^q (28), the same of r_y (28), sum w r_x x e'(v) and sum w r_y y e'(v) for the
-    excess, sum w r_x^2, sum w r_y^2, sum w.
+    Returns (SUMS,): sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum w r_y y e'(v) for
+    the excess, sum w r_x^2, sum w r_y^2, sum w.
     """
     sums = np.zeros(SUMS)
     block = np.empty((5, _BLOCK))
@@ -200,8 +200,8 @@ def residual_sums(rays, t, screen, weights, pinhole, plane, face, poly, excess, 
 def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # type: ignore[no-untyped-def]
     """Moments from which the normal matrix is made.
 
-    Returns (PRODUCTS,): sum w x^p y^q with p + q <= 12 (91), sum w e' x x^p y^q and sum w e' y x^p y^q with
-    p + q <= 6 (28 each), sum w (e' x)^2, sum w (e' y)^2.
+    Returns (PRODUCTS,): sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p y^q with
+    SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
     """
     sums = np.zeros(PRODUCTS)
     block = np.empty((5, _BLOCK))
@@ -231,9 +231,9 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
 def invert(matrix):  # type: ignore[no-untyped-def]
     """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result, if it is not one.
 
-    36 x 36 takes some 20 us here; on a busy machine the linear algebra library may wait a thousand times longer for
-    its threads. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below 1e-13 of its
-    diagonal element is only rounding.
+    A 36 x 36 matrix takes some 20 us here; on a busy machine the linear algebra library may wait a thousand times
+    longer for its threads. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below 1e-13
+    of its diagonal element is only rounding.
     """
     size = matrix.shape[0]
     diagonal = np.diag(matrix).copy()

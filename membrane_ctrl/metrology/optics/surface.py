@@ -1,7 +1,7 @@
-"""The fitted surface: 36 Zernike terms plus the part of a Hencky bowl that they cannot represent.
+"""The fitted surface: Zernike terms plus the part of a Hencky bowl that they cannot represent.
 
-The excess is orthogonal to the 36 terms over the disc, so the coefficients are those of the whole surface whatever
-its amplitude: a shape made of 36 terms has amplitude 0, a true Hencky bowl has its own sag.
+The excess is orthogonal to the terms over the disc, so the coefficients are those of the whole surface whatever
+its amplitude: a shape made of the terms has amplitude 0, a true Hencky bowl has its own sag.
 """
 
 import math
@@ -22,14 +22,14 @@ PARAMETERS = ZERNIKE_TERMS  # all but piston, which follows from h(0) = 0, and t
 class Surface:
     """Height above the vertex, h(0, 0) = 0, over a disc."""
 
-    coeffs_mm: FloatArray  # (36,): Noll j = 1..36, orthonormal; piston is whatever makes h(0, 0) = 0
+    coeffs_mm: FloatArray  # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
     hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
     radius_mm: float  # radius of the Zernike disc
     beyond_mm: tuple[float, ...] = ()  # of `film_law.BEYOND`: a calibration's; a measurement has none
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
-        """The surface of a parameter vector [a_2..a_36, excess with unit RMS] in mm; piston set for h(0, 0) = 0."""
+        """The surface of parameters [a_2, a_3, ..., excess with unit RMS] in mm; piston makes h(0, 0) = 0."""
         hencky_mm = float(parameters[-1]) / film_law.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
@@ -40,12 +40,12 @@ class Surface:
 
     @property
     def parameters(self) -> FloatArray:
-        """[a_2..a_36, excess with unit RMS] in mm."""
+        """[a_2, a_3, ..., excess with unit RMS] in mm."""
         return np.append(self.coeffs_mm[1:], self.hencky_mm * film_law.excess_rms())
 
     @cached_property
     def polynomial(self) -> FloatArray:
-        """The Zernike part as a polynomial (8, 8) in x / R, y / R."""
+        """The Zernike part as a polynomial (degree + 1, degree + 1) in x / R, y / R."""
         return zernike.polynomial(self.coeffs_mm)
 
     @cached_property
@@ -98,7 +98,7 @@ class Surface:
 
 @cache
 def parameter_to_coeffs() -> FloatArray:
-    """Matrix (36, 36) from parameters to Noll coefficients.
+    """Matrix (terms, parameters) from parameters to Noll coefficients.
 
     Row 1 is the piston that puts the vertex at 0: a_1 = -(sum over j >= 2 of a_j Z_j(0) + excess(0)).
     """
@@ -111,7 +111,7 @@ def parameter_to_coeffs() -> FloatArray:
 
 @cache
 def sag_gradient() -> FloatArray:
-    """d sag / d parameters (36,): mean over the rim minus the vertex, term by term."""
+    """d sag / d parameters (parameters,): mean over the rim minus the vertex, term by term."""
     excess = film_law.excess()
     rim_minus_vertex = (excess.sum() - excess[0]) / film_law.excess_rms()
     return np.append((zernike.at_rim() - zernike.at_vertex())[1:], rim_minus_vertex)
@@ -121,7 +121,7 @@ def sag_gradient() -> FloatArray:
 def height_probe() -> FloatArray:
     """Matrix from parameters to heights at 512 points spread evenly over the disc (a sunflower), vertex at 0.
 
-    Enough to see the largest height of a degree-7 surface to a few per cent.
+    Enough to see the largest height of such a surface to a few per cent.
     """
     k = np.arange(512)
     rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
@@ -133,7 +133,8 @@ def height_probe() -> FloatArray:
 
 @cache
 def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x and y (n,) over the unit disc, and least squares (39, n) from heights there to parameters and `BEYOND`."""
+    """x and y (n,) over the unit disc, and least squares (parameters + 3, n) from heights there to the
+    parameters and `BEYOND`."""
     k = np.arange(1024)
     rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
@@ -192,7 +193,7 @@ class Artefact:
         return f"it is not the {self.name} that its file states, it stood elsewhere, or it was out of focus"
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
-        """Parameters (36,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
+        """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
         x, y, onto = _from_heights()
         return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))
 

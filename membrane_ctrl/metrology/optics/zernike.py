@@ -1,7 +1,7 @@
-"""Zernike terms j = 1..36 in Noll's order, orthonormal over the unit disc, as polynomials in x and y.
+"""The first `ZERNIKE_TERMS` Zernike terms in Noll's order, orthonormal over the unit disc, as polynomials in x and y.
 
-The 36 terms are all terms of radial order 7 or less, that is exactly all polynomials of degree 7 in x and y: a sum
-of them is evaluated as one such polynomial, which costs 36 multiplications instead of 36 radial functions.
+They are all terms up to radial order `ZERNIKE_DEGREE`, that is exactly all polynomials of this degree in x and y: a
+sum of them is evaluated as one such polynomial, which costs a multiplication a term instead of a radial function.
 
 Source: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976): even j takes the cosine, odd j the sine.
 """
@@ -30,7 +30,7 @@ def noll(j: int) -> tuple[int, int]:
 
 
 def osa_from_noll(per_term: FloatArray) -> FloatArray:
-    """Values (36, ...) per term in the order of OSA/ANSI's index j = 0..35, of the same terms in Noll's order."""
+    """Values (terms, ...) in the order of OSA/ANSI's index from 0, of the same terms in Noll's order."""
     orders = [noll(j) for j in NOLL_INDICES]
     return np.asarray(per_term)[sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)]
 
@@ -49,14 +49,14 @@ def fringe(j: int) -> tuple[int, int]:
 
 @cache
 def monomial_table() -> FloatArray:
-    """Coefficients (36, 8, 8): Z_j = sum over p, q of table[j - 1, p, q] x^p y^q, on the unit disc."""
+    """Coefficients (terms, degree + 1, degree + 1): Z_j = sum over p, q of table[j - 1, p, q] x^p y^q."""
     table = np.stack([_polynomial(j) for j in NOLL_INDICES])
     table.setflags(write=False)
     return table
 
 
 def _polynomial(j: int) -> FloatArray:
-    """One of the 36 terms, with unit RMS over the disc."""
+    """One of the terms, with unit RMS over the disc."""
     n, m = noll(j)
     return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * term(n, m, ZERNIKE_DEGREE)
 
@@ -77,12 +77,12 @@ def term(n: int, m: int, degree: int) -> FloatArray:
 
 
 def polynomial(coeffs: FloatArray) -> FloatArray:
-    """The sum of the terms as one polynomial (8, 8) in x and y."""
+    """The sum of the terms as one polynomial (degree + 1, degree + 1) in x and y."""
     return np.asarray(np.tensordot(coeffs, monomial_table(), axes=1))
 
 
 def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
-    """All terms, (36, ...), at points of the unit disc; or the polynomials of a table like theirs."""
+    """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like theirs."""
     table = monomial_table() if table is None else table
     p, q = np.array([(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]).T
     powers_x = np.stack([x**k for k in range(ZERNIKE_DEGREE + 1)])
@@ -91,7 +91,7 @@ def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> Flo
 
 
 def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """d/dx and d/dy of all terms, each (36, ...), at points of the unit disc."""
+    """d/dx and d/dy of all terms, each (terms, ...), at points of the unit disc."""
     return values(x, y, differentiate(monomial_table(), 1)), values(x, y, differentiate(monomial_table(), 2))
 
 
@@ -103,12 +103,12 @@ def differentiate(table: FloatArray, axis: int) -> FloatArray:
 
 
 def at_vertex() -> FloatArray:
-    """All terms (36,) at the centre of the disc."""
+    """All terms (terms,) at the centre of the disc."""
     return monomial_table()[:, 0, 0].copy()
 
 
 def at_rim() -> FloatArray:
-    """Mean over azimuth (36,) of all terms on the rim: only m = 0 is left, with R(1) = 1."""
+    """Mean over azimuth (terms,) of all terms on the rim: only m = 0 is left, with R(1) = 1."""
     orders = [noll(j) for j in NOLL_INDICES]
     return np.array([math.sqrt(n + 1) if m == 0 else 0.0 for n, m in orders])
 

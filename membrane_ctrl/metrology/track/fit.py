@@ -1,6 +1,6 @@
 """The fit of one frame: Gauss-Newton on the light of its bins, for the surface and for what changes smoothly.
 
-With J the derivatives of the bins' light by 36 parameters of the surface and 3 x 36 of the maps of level and swings,
+With J the derivatives of the bins' light by the parameters of the surface and of the maps of level and swings,
 W weights, 0 for outliers and fading where the bins end, and r the residual, a step is (J^T W J)^-1 J^T W r. The
 matrix is kept from step to step and from frame to frame: where J^T W r vanishes is the solution whatever matrix led
 there. It is made anew where steps shrink too slowly. J of a bin is fringes times what changes slowly over the mirror
@@ -9,7 +9,7 @@ there. It is made anew where steps shrink too slowly. J of a bin is fringes time
 Steps of the pattern give level, swings and phases of each bin without orders and without smoothness. With the phases
 that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i (phi_xk + d_xk))] + the same of y is linear in
 A, z_x, z_y of a bin; l and b are the maps that the fits found. The angles of z are shape that the surface lacks: what
-36 terms can represent moves the surface, the rest stays with the bin.
+the terms can represent moves the surface, the rest stays with the bin.
 """
 
 import math
@@ -56,7 +56,7 @@ class FrameFit:
     """Solution of one frame."""
 
     surface: Surface
-    light: FloatArray  # (3, 36): relative change of level and swings against the scene's, as Noll terms
+    light: FloatArray  # (3, terms): relative change of level and swings against the scene's, as Noll terms
     residual_adu: Singles  # (n,): light less the model's
     weights: Singles  # (n,): 1, falling to 0 for outliers
     converged: bool
@@ -69,7 +69,8 @@ class FrameFit:
 
 
 class FrameFitter:
-    """Fits frame after frame of a scene; a `jacobian` (2, 36, 3, N) of the same bins and surface need not be made."""
+    """Fits frame after frame of a scene; a `jacobian` (2, parameters, 3, N) of the same bins and surface need
+    not be made."""
 
     def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
         self.scene, self.bands = scene, bands
@@ -184,7 +185,8 @@ class FrameFitter:
         return np.asarray(matrix * np.outer(scale, scale))
 
     def covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, noise_adu: float) -> FloatArray:
-        """Covariance (36, 36) of the parameters from what the fit leaves, or from the noise where that is larger.
+        """Covariance (parameters, parameters) of the parameters from what the fit leaves, or from the noise where
+        that is larger.
 
         Errors of neighbouring bins belong together (light that wanders): what a square contributes to the solution
         counts as one error, and the squares as independent. Maps of light are refitted with the surface, so that
@@ -223,7 +225,8 @@ class FrameFitter:
         return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
 
     def period_um(self) -> FloatArray:
-        """Change (2, 36) of the parameters that looks like one period along x, along y, in all of the mirror."""
+        """Change (2, parameters) of the parameters that looks like one period along x, along y, in all of the
+        mirror."""
         means = self.jacobian[:, :, 0].astype(float)
         matrix = sum(j @ j.T for j in means)
         return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
@@ -249,7 +252,8 @@ def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
 def stepped(
     fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
 ) -> tuple[CrossedScene, FloatArray, FloatArray]:
-    """The scene as the steps saw it; by how much that moves the surface's parameters (36,), and their variance.
+    """The scene as the steps saw it; by how much that moves the surface's parameters (parameters,), and their
+    variance.
 
     `fits` are those of the N single frames, `seen_adu` (N, n) their bins, `shifts_rad` (N, 2) their steps.
     """
@@ -276,7 +280,7 @@ def stepped(
 
 
 def _split(fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Phases (2, n) as a change of the surface's parameters (36,), its variance, and what is left of them."""
+    """Phases (2, n) as a change of the surface's parameters (parameters,), its variance, and what is left of them."""
     weight, slow, cells = weight**2, fitter.jacobian, fitter.scene.cells
     weighted = slow[:, :, 0] * cells.sums(weight)[:, None]  # it need not be exact: what is left is solved again
     matrix: FloatArray = np.sum(weighted @ slow[:, :, 0].transpose(0, 2, 1), axis=0, dtype=float)

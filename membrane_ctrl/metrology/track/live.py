@@ -215,7 +215,7 @@ class Stethoscope:
         return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
 
     def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
-        """Search a minute of terms (n, 36) at times (n,); a line of several possible frequencies is not told."""
+        """Search a minute of terms (n, terms) at times (n,); a line of several possible frequencies is not told."""
         found = find_modes(time_s, terms_um)
         if found is None:
             return []

@@ -56,7 +56,7 @@ class VibrationMode:
     frequency_hz: float
     sigma_hz: float
     amplitude_nm: float  # of the oscillation, RMS over the mirror, whose ring rests
-    shape: FloatArray  # (36,): terms, unit RMS; the largest is positive
+    shape: FloatArray  # (terms,): terms, unit RMS; the largest is positive
     evidence: float  # T less that of noise
     # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
     aliases_hz: tuple[float, ...] = ()
@@ -79,7 +79,7 @@ class _Piece:
     blind: BoolArray  # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
 
     def projected(self, terms_um: FloatArray) -> ComplexArray:
-        """X (frequencies, 35) of terms (n, 35)."""
+        """X (frequencies, terms - 1) of terms (n, terms - 1)."""
         return np.asarray(self.waves @ (self.window[:, None] * terms_um))
 
     def goes_with(self, frequency_hz: float) -> BoolArray:
@@ -88,7 +88,8 @@ class _Piece:
         return np.asarray(np.abs(self.alias_hz - alias_hz) < (_TAKEN[-1] + 1) / PIECE_S)
 
     def noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
-        """Noise (frequencies, 35) under the lines, a function of the alias that falls with it: drift, then white.
+        """Noise (frequencies, terms - 1) under the lines, a function of the alias that falls with it: drift, then
+        white.
 
         Medians over bands of half an octave (power is exponential: its median is ln 2 of its mean), none larger than
         that of a slower band, in which a line has less to say. What is `gone` with a line is left out if other power
@@ -109,7 +110,8 @@ class _Piece:
         return np.exp(np.column_stack([np.interp(at, middles, logs[:, j]) for j in range(power.shape[1])]))
 
     def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
-        """The terms without oscillations about a frequency that `shapes` (35, 35) projects on; others stay."""
+        """The terms without oscillations about a frequency that `shapes` (terms - 1, terms - 1) projects on; others
+        stay."""
         times = 2 * np.pi * (self.time_s - self.time_s[0])
         phases = [(frequency_hz + offset / PIECE_S) * times for offset in _TAKEN]
         base = np.column_stack([wave(phase) for phase in phases for wave in (np.cos, np.sin)])
@@ -117,7 +119,7 @@ class _Piece:
 
 
 def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0) -> tuple[VibrationMode, ...] | None:
-    """Vibrations in terms (n, 36) of frames at times (n,), NaN where a frame was rejected; the strongest first.
+    """Vibrations in terms (n, terms) of frames at times (n,), NaN where a frame was rejected; the strongest first.
 
     None if there are less than 20 s of frames at a steady rate.
     """
@@ -281,7 +283,8 @@ def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, floa
 def _shape(
     lines: Sequence[ComplexArray], pieces: Sequence[_Piece], noises: Sequence[FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Amplitude in nm and terms (36,) of unit RMS with the ring at rest, from X (35,) of each piece at the line.
+    """Amplitude in nm and terms (terms,) of unit RMS with the ring at rest, from X (terms - 1,) of each piece at the
+    line.
 
     All terms are in phase. A piece that has the line among slow motion, which is a shape too, has little weight.
     """
@@ -295,7 +298,7 @@ def _shape(
 
 
 def _onto(shape: FloatArray, noise: FloatArray) -> FloatArray:
-    """What takes terms to their part in a shape, (35, 35), told by those with little noise.
+    """What takes terms to their part in a shape, (terms - 1, terms - 1), told by those with little noise.
 
     The film's slow motion is mostly one term: by all of them alike, it would be taken for the shape's other terms.
     """

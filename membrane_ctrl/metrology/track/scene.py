@@ -2,7 +2,7 @@
 
 A bin shows I = A + B_x cos(phi_x + d_x) + B_y cos(phi_y + d_y) + harmonics. Its phases are those of the screen points
 that the surface sends its ray to, traced exactly, plus what the reference saw beyond its own fit: averaging over the
-bin, and shape that 36 terms cannot represent. Light and response of the panel are the reference's.
+bin, and shape that the terms cannot represent. Light and response of the panel are the reference's.
 """
 
 import math
@@ -26,7 +26,7 @@ _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
 _AT = 0, PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS  # in `Cells.blocks`: x, y, then the maps' terms
-_ENOUGH_BINS = 10_000  # fewer cannot carry 36 terms and three maps of 36
+_ENOUGH_BINS = 10_000  # fewer cannot carry the terms and three maps of as many
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
 _RESPONSE_POWERS = (2, 3, 4, 5)
@@ -56,7 +56,7 @@ class CrossedScene:
     points: reconstruct.Points  # their rays; `t_mm` moves with the surface that was traced last
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
-    basis: Singles  # (36, n): Noll terms at the bins, for what changes smoothly
+    basis: Singles  # (terms, n): Noll's order at the bins, for what changes smoothly
     taper: Singles  # (n,): weight, which fades to 0 where the bins end
     edge: Singles  # (n,): the same, 0 for bins that changed between the last five steps
     position_mm: FloatArray  # (2, n): on the mirror
@@ -77,7 +77,7 @@ class CrossedScene:
         return (seen + self.half_side_mm) * self.rad_per_mm - math.pi
 
     def jacobian(self, shape: Surface) -> Singles:
-        """Change (2, 36, n) of the phases per mm of each parameter of the surface."""
+        """Change (2, parameters, n) of the phases per mm of each parameter of the surface."""
         out = np.empty((2, PARAMETERS, self.index.size), np.float32)
         for k, change_mm in enumerate(np.eye(PARAMETERS) * _STEP_MM):
             above, below = (
@@ -164,12 +164,13 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
 @kernel
 def light_left(base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out):  # type: ignore[no-untyped-def]
     """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a relative change of all
-    light and e w times its square; and in `right` (4, 36) the sums of e w r times the derivatives by `changes`.
+    light and e w times its square; and in `right` (4, parameters) the sums of e w r times the derivatives by
+    `changes`.
 
-    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by `changes` (4, 36), of
-    the surface's parameters and of the maps of A, B_x, B_y, times `slow`, as in `Cells.blocks`; `offset` as in
-    `Cells`. `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends; 0 leaves out. All but
-    `right` are of single precision and without gaps, or no vector units are used.
+    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by `changes`
+    (4, parameters), of the surface's parameters and of the maps of A, B_x, B_y, times `slow`, as in `Cells.blocks`;
+    `offset` as in `Cells`. `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends; 0 leaves
+    out. All but `right` are of single precision and without gaps, or no vector units are used.
     """
     rows, planes = np.empty(9 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)

@@ -37,8 +37,8 @@ class TrackedFrame:
     """Figure of one frame; NaN where it is rejected."""
 
     time_s: float  # middle of the exposure
-    coeffs_um: FloatArray  # (36,) Noll j = 1..36, the vertex at 0
-    covariance_um2: FloatArray  # (36, 36): of the error against the reference's figure
+    coeffs_um: FloatArray  # (terms,) in Noll's order, the vertex at 0
+    covariance_um2: FloatArray  # (terms, terms): of the error against the reference's figure
     hencky_um: float
     sag_um: float
     sag_sigma_um: float
@@ -52,7 +52,7 @@ class TrackedFrame:
 
     @property
     def sigma_um(self) -> FloatArray:
-        """(36,): 1 sigma against the reference's figure."""
+        """(terms,): 1 sigma against the reference's figure."""
         return np.sqrt(np.diag(self.covariance_um2))
 
 
@@ -119,12 +119,13 @@ class StandingFrames:
 def steadied(
     places_mm: FloatArray, variance_mm2: FloatArray, drifted_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the mirror was in each of N steps, (N, 36) parameters and their variance, from the steps' own fits.
+    """Where the mirror was in each of N steps, (N, parameters) parameters and their variance, from the steps' own
+    fits.
 
     Five unknowns of a bin reproduce five steps whatever is assumed of the mirror's motion between them: an error of
     a step's place becomes an error of all later frames with its shifts. Fits of the steps that scatter about the
-    mirror's drift, `drifted_mm` (N, 36), as their errors do say that it did nothing else; the rest is its motion,
-    parameter by parameter.
+    mirror's drift, `drifted_mm` (N, parameters), as their errors do say that it did nothing else; the rest is its
+    motion, parameter by parameter.
     """
     error_mm2 = variance_mm2.mean(axis=0)
     steady_mm = places_mm.mean(axis=0) + drifted_mm - drifted_mm.mean(axis=0)
@@ -160,7 +161,7 @@ class Jumps:
         return stepped
 
     def variance_mm2(self, place_mm2: FloatArray) -> FloatArray:
-        """Of the parameters (36,), beyond that of the steps' places, which jump, too.
+        """Of the parameters (parameters,), beyond that of the steps' places, which jump, too.
 
         Zeros where frames of one step scatter nearly as much.
         """
@@ -297,14 +298,15 @@ class LostOrders:
         )
 
     def odd_um(self, change_um: FloatArray) -> FloatArray:
-        """RMS of a change (..., 36) without its tilt and without its bowl."""
+        """RMS of a change (..., parameters) without its tilt and without its bowl."""
         rest = np.array(change_um)
         rest[..., :2] = 0.0
         rest -= (rest @ self._bowl)[..., None] * self._bowl
         return np.asarray(np.linalg.norm(rest, axis=-1))
 
     def doubt(self, change_um: FloatArray, passed_s: float, displacement_um: float) -> Finding | None:
-        """Whether a change (36,) is none of this mirror's; `displacement_um` is that of the laser, NaN without."""
+        """Whether a change (parameters,) is none of this mirror's; `displacement_um` is that of the laser, NaN
+        without."""
         if not self.sure(change_um, passed_s):
             tilt_um, odd_um = np.hypot(*change_um[:2]), self.odd_um(change_um)
             return Finding(

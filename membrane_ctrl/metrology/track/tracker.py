@@ -80,7 +80,7 @@ class Tracker:
         self._left, self._count = np.zeros(scene.index.size), 0
 
     def _begin(self, scene: CrossedScene, shape: surface.Surface, light: FloatArray) -> None:
-        """Start from a scene, a surface and maps (3, 36) of light."""
+        """Start from a scene, a surface and maps (3, terms) of light."""
         none, all_bins = np.zeros(scene.index.size, np.float32), np.ones(scene.index.size, np.float32)
         self._swing_adu = float(np.median(scene.light_adu[1]))
         self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
@@ -125,9 +125,9 @@ class Tracker:
         seen_adu: Singles,
         shifts_rad: list[tuple[float, float]],
     ) -> FloatArray:
-        """Light, swings and phases of each bin from steps; returns by how much the parameters (36,) move.
+        """Light, swings and phases of each bin from steps; returns by how much the parameters (parameters,) move.
 
-        `variance_mm2` are those of the fits' parameters, each (36,).
+        `variance_mm2` are those of the fits' parameters, each (parameters,).
         """
         old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
         fitted = np.array([fit.surface.parameters for fit in fits])
@@ -145,7 +145,7 @@ class Tracker:
         return moved
 
     def _drift_mm_per_s(self, time_s: float, place_mm: FloatArray) -> FloatArray:
-        """Of the parameters (36,), from the mean place in the last five steps to that in these.
+        """Of the parameters (parameters,), from the mean place in the last five steps to that in these.
 
         The mean of five steps is free of the errors of each. Taken from the steps themselves, a drift was lost in
         these errors: 0.1 um in a cycle of five became a saw-tooth of as much.
@@ -192,7 +192,8 @@ class Tracker:
             self._renew(times_s, fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown)
 
     def _place_mm2(self, shifts_rad: tuple[float, float]) -> FloatArray:
-        """Variance (36,) of the place at which the steps saw the mirror with these shifts, common to their frames."""
+        """Variance (parameters,) of the place at which the steps saw the mirror with these shifts, common to their
+        frames."""
         return self._places_mm2.get(shifts_rad, np.zeros(surface.PARAMETERS))
 
     def follow(

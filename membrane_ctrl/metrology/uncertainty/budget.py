@@ -1,6 +1,6 @@
 """The budget of a figure's uncertainty: what each input contributes (JCGM 100, clause 5).
 
-An input with the standard uncertainty u changes the figure's 36 parameters by c u, with c its sensitivity: one
+An input with the standard uncertainty u changes the figure's parameters by c u, with c its sensitivity: one
 solution of the thinned points with the input off by u. Inputs of type B (data sheets, rulers) are known before the
 measurement; those of type A are seen in the set itself. Inputs that all sets of a bench share cancel in a change
 between two sets.
@@ -42,7 +42,7 @@ class Source:
     name: str  # ends in the unit of `sigma`
     says: str
     sigma: float  # standard uncertainty of the input; NaN for several at once
-    effects_mm: FloatArray  # (36, k): independent changes of the parameters, of 1 sigma each, from this input
+    effects_mm: FloatArray  # (parameters, k): independent changes of the parameters, of 1 sigma each, from this input
     common: bool = True  # whether all sets of a bench share it
     paired: bool = True  # whether two sets have the same error in the same column: it cancels in a change
     noise_mm2: float = 0.0  # sum of squares of noise in effects that the set shows: the noise has a row of its own
@@ -55,7 +55,7 @@ class Source:
 
     @property
     def covariance_mm2(self) -> FloatArray:
-        """(36, 36) of the parameters."""
+        """Covariance (parameters, parameters)."""
         return np.asarray(self.known_mm @ self.known_mm.T)
 
     def change(self, earlier: "Source | None") -> list[FloatArray]:
@@ -76,12 +76,13 @@ class Budget:
     disc: float  # analysis radius over the radius of the terms
 
     def covariance(self, common: bool) -> FloatArray:
-        """(36, 36) in mm^2 of the parameters, from what all sets of the bench share or from this set's own."""
+        """(parameters, parameters) in mm^2 of the parameters, from what all sets of the bench share or from this
+        set's own."""
         parts = [source.covariance_mm2 for source in self.sources if source.common == common]
         return np.asarray(np.sum([np.zeros((PARAMETERS, PARAMETERS)), *parts], axis=0))
 
     def change_covariance(self, earlier: "Budget") -> FloatArray:
-        """(36, 36) in mm^2 of the parameters' change since another set of the same bench.
+        """(parameters, parameters) in mm^2 of the parameters' change since another set of the same bench.
 
         What both share cancels but for the difference of its effects on the two.
         """
@@ -102,7 +103,7 @@ class Budget:
         return sorted(rows, key=lambda row: -float(row["height_rms_um"]))
 
     def total(self) -> dict[str, Any]:
-        """1 sigma of sag, height, figure and of the 36 coefficients."""
+        """1 sigma of sag, height, figure and of the coefficients."""
         whole = self.covariance(True) + self.covariance(False)
         to_coeffs = parameter_to_coeffs()
         coeffs = 1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ whole @ to_coeffs.T), 0.0))
@@ -116,7 +117,7 @@ class Budget:
 
 @lru_cache
 def _products(disc: float) -> dict[str, FloatArray]:
-    """Means (36, 36) over a disc of products of what two parameters do to sag, height and figure."""
+    """Means (parameters, parameters) over a disc of products of what two parameters do to sag, height and figure."""
     heights, plane = propagate.disc(disc)
     basis = {"height_rms_um": heights, "figure_rms_um": propagate.without_plane(heights, plane)}
     return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {n: b.T @ b / len(b) for n, b in basis.items()}
@@ -246,7 +247,7 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
 
 @dataclass(frozen=True)
 class FrameEffects:
-    """Changes (36, frames) of the parameters in mm per unit of one frame's error, x frames first."""
+    """Changes (parameters, frames) of the parameters in mm per unit of one frame's error, x frames first."""
 
     level: FloatArray  # its light, relative
     swing: FloatArray  # the amplitude of its fringes and of their harmonics, relative
@@ -255,7 +256,7 @@ class FrameEffects:
 
     @property
     def x_to_y(self) -> FloatArray:
-        """(36,) per um of the film's motion from the x to the y frames."""
+        """(parameters,) per um of the film's motion from the x to the y frames."""
         x, y = np.split(self.film, 2, axis=1)
         return np.asarray((y.sum(axis=1) - x.sum(axis=1)) / 2)
 
@@ -339,7 +340,7 @@ class Patches:
         return cls.of(np.stack([x[seen], y[seen]]), grid.count[seen], slopes, float(grid.axis_mm[-1]))
 
     def effects(self, radius_mm: float, inverse: FloatArray) -> FloatArray:
-        """(36, patches) on the parameters if the residual slopes are independent from patch to patch only.
+        """(parameters, patches) on the parameters if the residual slopes are independent from patch to patch only.
 
         The patches are those of the mirror, whatever was seen: two sets of a bench have the same ones. `inverse` is
         that of the fit's normal matrix.

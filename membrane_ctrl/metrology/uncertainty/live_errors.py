@@ -46,14 +46,17 @@ class FramesSeen:
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Sensitivities of the parameters (36), in mm."""
+    """Sensitivities of the surface's parameters, in mm."""
 
     frames: budget.FrameEffects
-    vertex: FloatArray  # (36,): per um of the vertex' place
-    common_mm2: FloatArray  # (36, 36): covariance of what all cycles share; NaN if the spread is unknown or too wide
-    # (36, 36): covariance of what is left of that in a change, per um^2 of the film's displacement between the cycles
+    vertex: FloatArray  # (parameters,): per um of the vertex' place
+    # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or too wide
+    common_mm2: FloatArray
+    # (parameters, parameters): covariance of what is left of that in a change, per um^2 of the film's displacement
+    # between the cycles
     per_um2: FloatArray
-    # (36, 36): covariance of what the geometry makes of a film that was told to be 1 um deeper in x than in y
+    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be 1 um deeper in x
+    # than in y
     told_um2: FloatArray
 
     @classmethod
@@ -70,8 +73,8 @@ class LiveErrors:
     ) -> "LiveErrors":
         """Of some points of a cycle, and of the many more that the waves of uneven light need.
 
-        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left` (36, k) the effects of
-        the slopes that the fit leaves.
+        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left` (parameters, k) the
+        effects of the slopes that the fit leaves.
         """
         frames = budget.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
         vertex = budget.vertex_source(bench, 1.0, "").effects_mm[:, 0]
@@ -89,7 +92,7 @@ class LiveErrors:
         return cls(frames, vertex, here @ here.T + left @ left.T, per_um @ per_um.T, told @ told.T)
 
     def correction_mm(self, seen: FramesSeen) -> FloatArray:
-        """(36,) that the errors of the frames added to the parameters."""
+        """(parameters,) that the errors of the frames added to the parameters."""
         effects = self.frames
         # the phases were corrected for the told motion as if the fringes were pure sinusoids
         display = effects.display @ (seen.told_um + seen.moved_um)
@@ -100,7 +103,8 @@ class LiveErrors:
     def own_mm2(
         self, seen: FramesSeen, readings_um: FloatArray, laser_noise_um: float, moved_um: float
     ) -> FloatArray:
-        """Covariance (36, 36) in mm^2 of what the reference cycle does not share, without slopes and pixels.
+        """Covariance (parameters, parameters) in mm^2 of what the reference cycle does not share, without slopes and
+        pixels.
 
         It is from light and film as `seen` and taken out, from the laser's readings (2 N,) of the frames, and from
         the film's displacement since the reference.
@@ -125,7 +129,7 @@ class LiveErrors:
 
 
 def _shared(bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float) -> FloatArray:
-    """Effects (36, k) of what all cycles share. Raises ArithmeticError if a fit at the spread's end fails."""
+    """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the spread's end fails."""
     sources = [
         *budget.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
         budget.blur_source(bench, blur_px),
@@ -152,8 +156,9 @@ class Cycle:
 class CycleErrors:
     """What is known of the errors of one cycle."""
 
-    correction_mm: FloatArray  # (36,): to be subtracted from the parameters
-    own_mm2: FloatArray  # (36, 36): covariance of what the reference cycle does not share, without slopes and pixels
+    correction_mm: FloatArray  # (parameters,): to be subtracted from the parameters
+    # (parameters, parameters): covariance of what the reference cycle does not share, without slopes and pixels
+    own_mm2: FloatArray
     changed_rad2: FloatArray  # (2,): variance of the phases' change since the reference that no surface explains
     asked: int  # points it is known at
 
@@ -193,7 +198,7 @@ class ErrorWatch:
 
     @property
     def common_mm2(self) -> FloatArray:
-        """(36, 36) covariance of what all cycles share; NaN before the first, and without a spread."""
+        """Covariance (parameters, parameters) that all cycles share; NaN before the first, and without a spread."""
         return np.full((PARAMETERS, PARAMETERS), np.nan) if self._errors is None else self._errors.common_mm2
 
     def begin(self, state: motion.TrackedPoints) -> None:

@@ -2,7 +2,7 @@
 
 A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance of a bin's phase
 by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. A few thousand of the bins
-determine 36 terms: one in k, each with a k-th of the variance, gives the fit the same covariance as all of them. A
+determine the terms: one in k, each with a k-th of the variance, gives the fit the same covariance as all of them. A
 trial therefore draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or
 three Gauss-Newton steps from the fitted surface to the disturbed one.
 
@@ -87,7 +87,8 @@ class TrialBench:
     def solve(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> FloatArray:
-        """Parameters (36,) in mm of the surface on another bench, the screen points (2, n) off by a disturbance.
+        """Parameters (parameters,) in mm of the surface on another bench, the screen points (2, n) off by a
+        disturbance.
 
         One step suffices for a `linear` answer: the next would change it by 1/300.
 
@@ -134,7 +135,8 @@ def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
 def run_trials(
     benches: Sequence[TrialBench], spread: GeometrySpread, seed: int, trials: Sequence[int], first_set: int = 0
 ) -> FloatArray:
-    """Parameters (trials, sets, 36) in mm of the trials with these numbers; all sets share the geometry of a trial.
+    """Parameters (trials, sets, parameters) in mm of the trials with these numbers; all sets share the geometry of a
+    trial.
 
     The benches, one a set, have the same nominal geometry. `first_set` is the number of the first set in its run:
     noise differs from set to set.
@@ -150,7 +152,7 @@ def run_trials(
 
 # From the spread of the parameters to the spread of the height, and the linear covariance beside the Monte Carlo.
 #
-# The fitted height is linear in the 36 parameters, h = P a, so its standard deviation at every point follows from
+# The fitted height is linear in the parameters, h = P a, so its standard deviation at every point follows from
 # their covariance C alone: sigma^2 = diag(P C P^T). With C the sample covariance of the trials that is, to the last
 # bit of rounding, the standard deviation over the trials' heights: the paper's RMSE map.
 #
@@ -158,7 +160,7 @@ def run_trials(
 # two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so the live cycle
 # computes it once a full cycle.
 
-MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what 36 terms can change over
+MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what the terms can change over
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ class HeightMap:
 
     axis_mm: FloatArray  # (n,): of x and of y
     inside: BoolArray  # (n, n): rows along y
-    matrix: FloatArray  # (points, 36): heights, 0 at the vertex, of the points inside
+    matrix: FloatArray  # (points, parameters): heights, 0 at the vertex, of the points inside
 
     @classmethod
     def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
@@ -184,13 +186,13 @@ class HeightMap:
         return out
 
     def sigma(self, covariance: FloatArray) -> FloatArray:
-        """(points,) standard deviation for a covariance (36, 36) of the parameters, in its unit."""
+        """(points,) standard deviation for a covariance (parameters, parameters) of the parameters, in its unit."""
         variance = np.einsum("pi,pi->p", self.matrix @ covariance, self.matrix)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
-    """Matrix (points, 36) from parameters to heights, 0 at the vertex."""
+    """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
     out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, film_law.excess()) / film_law.excess_rms()
@@ -198,12 +200,13 @@ def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> Float
 
 
 def trial_covariance(parameters: FloatArray) -> FloatArray:
-    """Covariance (36, 36) over trials (trials, 36)."""
+    """Covariance (parameters, parameters) over trials (trials, parameters)."""
     return np.atleast_2d(np.cov(parameters, rowvar=False))
 
 
 def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
-    """Change (36, k) of the parameters in mm with each number of the geometry, by central differences of one sigma.
+    """Change (parameters, k) of the parameters in mm with each number of the geometry, by central differences of one
+    sigma.
 
     The difference is as wide as the spread itself, so that curvature counts as it does in the spread.
     """
@@ -220,17 +223,17 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
 
 
 def noise_covariance(bench: TrialBench) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the parameters from the noise of the pixels."""
+    """Covariance (parameters, parameters) in mm^2 from the noise of the pixels."""
     return bins.parameter_covariance(bench.normal, bench.slope_variance())
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
-    """Covariance (36, 36) in mm^2 of the parameters from the geometry; the live cycle reports it beside its own."""
+    """Covariance (parameters, parameters) in mm^2 from the geometry; the live cycle reports it beside its own."""
     return np.asarray(jacobian @ spread.covariance @ jacobian.T)
 
 
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
-    """What the Monte Carlo finds, without it: (36, 36) in mm^2.
+    """What the Monte Carlo finds, without it: (parameters, parameters) in mm^2.
 
     With two benches the covariance is that of the change between them: they share the geometry, not the noise.
     """

@@ -1,6 +1,6 @@
 """Statistics of a run of figures in memory that does not grow with it.
 
-The fitted height is linear in the 36 parameters: their running mean and covariance hold the standard deviation at
+The fitted height is linear in the parameters: their running mean and covariance hold the standard deviation at
 every point of the mirror (see `uncertainty.HeightMap.sigma`).
 """
 
@@ -86,8 +86,8 @@ class Moment:
 
     name: str  # of the set
     time_s: float  # its middle on the run's clock
-    parameters: FloatArray  # (36,): of its surface, in mm
-    trials: FloatArray  # (trials, 36): the same under the trials' geometries and noise
+    parameters: FloatArray  # (parameters,): of its surface, in mm
+    trials: FloatArray  # (trials, parameters): the same under the trials' geometries and noise
 
 
 @dataclass(frozen=True)
@@ -100,12 +100,12 @@ class FigurePair:
 
     @property
     def change(self) -> FloatArray:
-        """(36,) later minus earlier, in mm."""
+        """(parameters,) later minus earlier, in mm."""
         return self.later.parameters - self.earlier.parameters
 
     @property
     def covariance(self) -> FloatArray:
-        """(36, 36) in mm^2, of the change trial by trial."""
+        """(parameters, parameters) in mm^2, of the change trial by trial."""
         return trial_covariance(self.later.trials - self.earlier.trials)
 
 

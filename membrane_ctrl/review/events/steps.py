@@ -174,7 +174,7 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     good = held & still & (shapes.verdict != "rejected")
     if np.count_nonzero(good) < 4 * JUMP_HALF_CYCLES:
         return []
-    # all 36 terms of a month take 190 MB
+    # all terms of a month take 190 MB (36 of them)
     terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
     change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))

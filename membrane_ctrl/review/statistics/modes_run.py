@@ -50,7 +50,7 @@ class SeenMode:
 
     @property
     def shape(self) -> FloatArray:
-        """Terms (36,) of unit RMS: the mean of the searches', their signs aligned."""
+        """Terms (terms,) of unit RMS: the mean of the searches', their signs aligned."""
         together = np.array([line.shape for line in self.lines])
         return np.asarray(np.linalg.svd(together, full_matrices=False)[2][0])
 
@@ -94,7 +94,7 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
 
 
 def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
-    """Times, terms (n, 36) with NaN where rejected, and the UTC of time 0. Raises CommandError."""
+    """Times, terms (n, terms) with NaN where rejected, and the UTC of time 0. Raises CommandError."""
     if is_run(folder):
         run = open_run(folder)
         shapes, origin_s = run.shapes(), run.origin_utc.timestamp()

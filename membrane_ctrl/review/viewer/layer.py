@@ -314,7 +314,7 @@ def _size(size: float, unit: str) -> str:
 
 
 def _variances(cycles: shapes.Shapes) -> Column:
-    """(n, 36) variances of the coefficients, of the covariance recorded last before each cycle; 0 without any."""
+    """(n, terms) variances of the coefficients, of the covariance recorded last before each cycle; 0 without any."""
     if not cycles.covariance_time_s.size:
         return np.zeros_like(cycles.coeffs_um)
     place = np.searchsorted(cycles.covariance_time_s, cycles.time_s, side="right") - 1
