@@ -21,9 +21,11 @@ import numpy as np
 from benchmarks.figures import Figure, at_most
 from firmware_iface.display import ScreenRaster
 from firmware_iface.drivers.camera_aravis import AravisCamera
-from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
-from firmware_iface.roles import Pattern
-from firmware_iface.settings import AravisCameraConfig
+from firmware_iface.drivers.screen_pygame import PygameDisplay
+from firmware_iface.guarded_camera import GuardedCamera
+from firmware_iface.pattern_screen import PatternScreen
+from firmware_iface.roles import DriverClock, Pattern, SensorFormat
+from firmware_iface.settings import AravisCameraConfig, PygameScreenConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
 from membrane_ctrl.acquisition.optical_bench import DisplayTest
 from membrane_ctrl.acquisition.session import WaitingClock
@@ -80,7 +82,7 @@ class PanelScene:
 class ScreenOnPanel:
     """The X display, and the panel that lights up at its next refresh: nothing waits for it."""
 
-    def __init__(self, screen: PygameScreen, panel: EmulatedPanel[Shown]) -> None:
+    def __init__(self, screen: PatternScreen, panel: EmulatedPanel[Shown]) -> None:
         self.screen, self._panel = screen, panel
 
     def begin(self, pattern: Pattern) -> None:
@@ -165,9 +167,12 @@ def run() -> list[Figure]:
         stack.enter_context(x_display())
         scene = PanelScene(panel)
         stack.enter_context(GigeCameraEmulator(scene.expose, *size_px))
-        camera = AravisCamera(config, *size_px, clock.now, clock.sleep)
+        waits, sensor = DriverClock(clock.now, clock.sleep), SensorFormat(*size_px)
+        driver = AravisCamera(config, sensor, waits)
+        camera = GuardedCamera(driver, sensor, clock.now, "camera aravis")
         stack.callback(camera.close)
-        screen = ScreenOnPanel(PygameScreen(ScreenSettings(raster, patterns), None, clock.now, clock.sleep), panel)
+        display = PygameDisplay(PygameScreenConfig(width_px=WIDTH_PX, height_px=HEIGHT_PX, pixel_mm=PIXEL_MM))
+        screen = ScreenOnPanel(PatternScreen(display, raster, patterns, waits, "screen pygame"), panel)
         stack.callback(screen.close)
         camera.open()
         screen.screen.open()
@@ -188,7 +193,7 @@ def run() -> list[Figure]:
             clock,
             LaserAtRest(),
         )
-        return _figures(cycle, spent_s, found.settle_s, camera)
+        return _figures(cycle, spent_s, found.settle_s, driver)
 
 
 def _figures(cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, camera: AravisCamera) -> list[Figure]:

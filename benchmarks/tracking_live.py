@@ -19,7 +19,8 @@ import numpy as np
 from benchmarks.acquisition import LaserAtRest
 from benchmarks.figures import Figure, at_least, at_most
 from firmware_iface.drivers.camera_aravis import AravisCamera
-from firmware_iface.roles import Pattern
+from firmware_iface.guarded_camera import GuardedCamera
+from firmware_iface.roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig
 from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
 from membrane_ctrl.acquisition.session import WaitingClock
@@ -99,7 +100,9 @@ def _measured(screen: Panel) -> list[Figure]:
     clock = WaitingClock(RunClock.start())
     config = AravisCameraConfig(camera="127.0.0.1", exposure_ms=EXPOSURE_MS, packet_bytes=60_000)
     with ExitStack() as stack:
-        camera = AravisCamera(config, OPTICS.camera.width_px, OPTICS.camera.height_px, clock.now, clock.sleep)
+        sensor = SensorFormat(OPTICS.camera.width_px, OPTICS.camera.height_px)
+        driver = AravisCamera(config, sensor, DriverClock(clock.now, clock.sleep))
+        camera = GuardedCamera(driver, sensor, clock.now, "camera aravis")
         stack.callback(camera.close)
         camera.open()
         ring = FrameRing.for_optics(OPTICS)
@@ -125,7 +128,7 @@ def _measured(screen: Panel) -> list[Figure]:
             late_ms.append(1e3 * (clock.now() - one.estimate.time_s) - EXPOSURE_MS / 2)
             cycle.prepare()
         passed_s, busy_s = clock.now() - begin_s, time.process_time() - busy_s
-        lost = camera.counts.incomplete + camera.counts.missing
+        lost = driver.counts.incomplete + driver.counts.missing
     good = verdicts.count("ok")
     return [
         at_most(

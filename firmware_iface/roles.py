@@ -4,9 +4,10 @@ A driver converts to these units; nothing beyond it knows registers, counts or b
 """
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -285,6 +286,7 @@ class Screen(Protocol):
         """Release the screen."""
 
 
+@runtime_checkable
 class Camera(Protocol):
     """Takes frames."""
 
@@ -312,3 +314,60 @@ class ExposingCamera(Protocol):
 
     def fetch(self) -> Frame:
         """The frame of the last `expose`. Raises FrameLostError, LinkError."""
+
+
+# Drivers of cameras and displays. They run in the acquisition process, which waits for them: nothing is awaited.
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFormat:
+    """Picture of a camera as configured in `[optics.camera]`; a driver refuses a sensor that gives another one."""
+
+    width_px: int
+    height_px: int
+    bits: int = 8
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape of `Frame.pixels`: (height, width)."""
+        return self.height_px, self.width_px
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of a pixel: uint8 for 8 bits, uint16 for more."""
+        return np.dtype(np.uint8 if self.bits == 8 else np.uint16)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverClock:
+    """The run's clock and a way to wait on it, which a driver uses instead of `time`."""
+
+    now: Clock = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+
+
+class OpticalDevice(Protocol):
+    """A camera or a display. A camera is a `Camera` or, if its transfer may overlap, an `ExposingCamera` as well."""
+
+    def open(self) -> DeviceIdentity:
+        """Connect, check the identity, apply the settings and read them back; again after every lost link.
+
+        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (not the configured
+        device, or one that does not accept its settings).
+        """
+
+    def close(self) -> None:
+        """Release it; also while it is closed. Never raises."""
+
+    def describe(self) -> dict[str, str]:
+        """For people: port, settings, manual."""
+
+
+class Display(OpticalDevice, Protocol):
+    """A panel or projector that shows pictures pixel by pixel, without scaling or correction."""
+
+    def prepare(self, levels: Levels) -> Any:
+        """Convert a picture (height, width) to the form that `show` takes; called once for each pattern."""
+
+    def show(self, picture: Any) -> None:
+        """Send a prepared picture to the display; returns once it is queued. Raises LinkError."""

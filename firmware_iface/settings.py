@@ -60,6 +60,10 @@ _STEP = "Readings farther than this from both previous ones are rejected. Raise 
 StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
+_NAME = "Name under which the driver is installed. Set it to one that `devices` lists."
+DriverName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", description=_NAME)]
+
+
 class Optoncdt1420Config(Section):
     """Micro-Epsilon optoNCDT 1420 laser."""
 
@@ -212,24 +216,28 @@ class ModbusMapConfig(Section):
         return self
 
 
-class ExternalConfig(Section):
+class ExternalSection(Section):
+    """A device whose driver is a package of its own. Reading a configuration never loads that package."""
+
+    model_config = ConfigDict(extra="allow")
+
+    driver: Literal["external"]
+    name: DriverName
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """The keys of the table that its driver gets."""
+        return self.model_dump(exclude={"driver", "name"}, exclude_none=True)
+
+
+class ExternalConfig(ExternalSection):
     """An instrument whose driver is a package of its own (docs/new-device.md). The driver defines more keys.
 
     Reading a configuration never loads that package: only opening or emulating the devices does.
     """
 
-    model_config = ConfigDict(extra="allow")
-
-    driver: Literal["external"]
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
-    """Name under which the driver is installed. Set it to one that `devices` lists."""
     port: Port
     timeout_s: Timeout = 0.2
-
-    @property
-    def keys(self) -> dict[str, Any]:
-        """The keys of the table that its driver defines."""
-        return self.model_dump(exclude={"driver", "name"})
 
 
 Driver = Field(discriminator="driver")
@@ -321,7 +329,26 @@ class GpioLineConfig(PolledInterlockConfig):
 InterlockDriver = Annotated[BoardInputConfig | ModbusInputConfig | GpioLineConfig, Driver]
 
 
-class AravisCameraConfig(Section):
+class CameraSection(Section):
+    """A camera's table: what the program must know of its frames, whichever the driver."""
+
+    @property
+    def frame_exposure_s(self) -> float | None:
+        """Exposure of a frame; None if the driver does not state it."""
+        return None
+
+    @property
+    def frame_bits(self) -> int | None:
+        """Depth of a pixel; None if the driver gives the depth of `[optics.camera]`."""
+        return None
+
+    @property
+    def shows_patterns(self) -> bool:
+        """Whether the camera stands for a screen as well."""
+        return False
+
+
+class AravisCameraConfig(CameraSection):
     """A GenICam camera (USB3 Vision or GigE Vision)."""
 
     driver: Literal["aravis"] = "aravis"
@@ -342,13 +369,18 @@ class AravisCameraConfig(Section):
     """Longest wait for a frame, from the end of its exposure. Raise it on a slow network."""
 
     @property
-    def bits(self) -> int:
+    def frame_exposure_s(self) -> float:
+        """Exposure of a frame."""
+        return self.exposure_ms / 1000.0
+
+    @property
+    def frame_bits(self) -> int:
         """Depth of a pixel."""
         return int(self.pixel_format[-2:]) if self.pixel_format[-2:].isdigit() else 8
 
 
-class UvcCameraConfig(Section):
-    """A USB camera without GenICam."""
+class UvcCameraConfig(CameraSection):
+    """A USB camera without GenICam. It gives 8 bits."""
 
     driver: Literal["uvc"] = "uvc"
     port: str = "0"
@@ -357,24 +389,44 @@ class UvcCameraConfig(Section):
     """Exposure in the camera's own unit, often 0.1 ms; 0 leaves it. Set it so that white does not saturate."""
     gain: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Gain in the camera's own unit; 0 leaves it. Raise it only if the exposure cannot be longer."""
-    bits: Literal[8] = 8
-    """Depth of a pixel. Leave it: these cameras give 8 bits."""
+
+    @property
+    def frame_bits(self) -> int:
+        """Depth of a pixel."""
+        return 8
 
 
-class FolderCameraConfig(Section):
+class FolderCameraConfig(CameraSection):
     """Pictures from a folder instead of a camera and a screen."""
 
-    driver: Literal["folder"]
+    driver: Literal["folder"] = "folder"
     folder: Annotated[str, Field(min_length=1)]
     """Folder of pictures named like the patterns, e.g. x_sin_0.png. Set it to a capture set."""
 
+    @property
+    def shows_patterns(self) -> bool:
+        """Each picture is the one of the pattern to show."""
+        return True
 
-class PygameScreenConfig(Section):
-    """The display with the fringes."""
 
-    driver: Literal["pygame"] = "pygame"
-    display: Annotated[int, Field(ge=0, le=15)] = 0
-    """Number of the display. Change it if the desktop has several."""
+class ExternalCameraConfig(CameraSection, ExternalSection):
+    """A camera whose driver is a package of its own (docs/new-camera.md). The driver defines more keys.
+
+    Reading a configuration never loads that package: only opening or emulating the camera does.
+    """
+
+    exposure_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    """Exposure of a frame; absent: the driver does not state it. Set it if the driver has this key."""
+
+    @property
+    def frame_exposure_s(self) -> float | None:
+        """Exposure of a frame; None if the driver does not state it."""
+        return None if self.exposure_ms is None else self.exposure_ms / 1000.0
+
+
+class ScreenSection(Section):
+    """A screen's table: what the program must know of its pixels and its light, whichever the driver."""
+
     width_px: Annotated[int, Field(ge=16, le=16_384)]
     """Columns of the panel. Set it to the panel's own; `devices` lists them."""
     height_px: Annotated[int, Field(ge=16, le=16_384)]
@@ -391,4 +443,20 @@ class PygameScreenConfig(Section):
     """Test exposure and panel at the start. Set it to false to start sooner."""
 
 
-CameraConfig = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig, Field(discriminator="driver")]
+class PygameScreenConfig(ScreenSection):
+    """A display of this machine's desktop."""
+
+    driver: Literal["pygame"] = "pygame"
+    display: Annotated[int, Field(ge=0, le=15)] = 0
+    """Number of the display. Change it if the desktop has several."""
+
+
+class ExternalScreenConfig(ScreenSection, ExternalSection):
+    """A screen whose driver is a package of its own (docs/new-camera.md). The driver defines more keys.
+
+    Reading a configuration never loads that package: only opening or emulating the screen does.
+    """
+
+
+CameraConfig = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig | ExternalCameraConfig, Driver]
+ScreenConfig = Annotated[PygameScreenConfig | ExternalScreenConfig, Driver]

@@ -1,42 +1,84 @@
 """Drivers of devices, each of which fills a role of `roles.py`; and those of other packages.
 
-Another package names its driver in the entry point group `membrane_ctrl.drivers`, and an emulator of the instrument
-in `membrane_ctrl.emulators` (docs/new-device.md). Only an installed package is ever executed: no configuration, run
+A package names its driver in the entry point group of its kind, and an emulator of the device in the group of its
+emulators (docs/new-device.md). The drivers of cameras and screens in this package are entry points as well, listed
+below. Only an installed package is ever executed, and only when a configuration names it: no configuration, run
 folder or working folder can name a file.
 """
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-DRIVERS, EMULATORS = "membrane_ctrl.drivers", "membrane_ctrl.emulators"
+
+@dataclass(frozen=True, slots=True)
+class DriverKind:
+    """A kind of driver: its name for people, its entry point groups, and the drivers of this package in the first."""
+
+    name: str
+    group: str
+    emulators: str
+    built_in: tuple[tuple[str, str], ...] = ()  # name and object of an entry point
 
 
-def installed(group: str = DRIVERS) -> Iterator["EntryPoint"]:
-    """Yield the drivers (or emulators) that other packages provide, by name; loads none of them."""
+SENSORS = DriverKind("driver", "membrane_ctrl.drivers", "membrane_ctrl.emulators")
+CAMERAS = DriverKind(
+    "camera driver",
+    "membrane_ctrl.cameras",
+    "membrane_ctrl.camera_emulators",
+    (
+        ("aravis", "firmware_iface.drivers.camera_aravis:AravisCamera"),
+        ("folder", "firmware_iface.drivers.camera_opencv:FolderCamera"),
+        ("uvc", "firmware_iface.drivers.camera_opencv:UvcCamera"),
+    ),
+)
+SCREENS = DriverKind(
+    "screen driver",
+    "membrane_ctrl.screens",
+    "membrane_ctrl.screen_emulators",
+    (("pygame", "firmware_iface.drivers.screen_pygame:PygameDisplay"),),
+)
+KINDS = (SENSORS, CAMERAS, SCREENS)
+
+
+def list_installed(group: str) -> list["EntryPoint"]:
+    """List what other packages provide in a group, by name; load none of it."""
     from importlib.metadata import entry_points
 
-    yield from sorted(entry_points(group=group), key=lambda entry: entry.name)
+    return sorted(entry_points(group=group), key=lambda entry: entry.name)
 
 
-def load(name: str, group: str = DRIVERS) -> Any:
-    """Import the driver class (or emulator class) that another package installs under this name.
+def load_driver(name: str, kind: DriverKind) -> Any:
+    """Import the driver class of this name. Raises ValueError if none or several exist, or if it cannot be loaded."""
+    from importlib.metadata import EntryPoint
 
-    Raises ValueError if none or several do, or if it cannot be imported.
-    """
-    found = [entry for entry in installed(group) if entry.name == name]
-    kind = "emulator" if group == EMULATORS else "driver"
+    built_in = [EntryPoint(name, value, kind.group) for name, value in kind.built_in]
+    return _load(name, kind.name, built_in + list_installed(kind.group))
+
+
+def load_emulator(name: str, kind: DriverKind) -> Any:
+    """Import the emulator class of the device of this driver. Raises ValueError as `load_driver`."""
+    return _load(name, f"{kind.name.removesuffix('driver')}emulator", list_installed(kind.emulators))
+
+
+def has_emulator(name: str, kind: DriverKind) -> bool:
+    """Return whether an emulator of the device of this driver is installed."""
+    return any(entry.name == name for entry in list_installed(kind.emulators))
+
+
+def _load(name: str, what: str, entries: list["EntryPoint"]) -> Any:
+    found = [entry for entry in entries if entry.name == name]
     if not found:
-        known = ", ".join(entry.name for entry in installed(group)) or "none"
-        raise ValueError(f"no {kind} {name!r} is installed; installed: {known} (docs/new-device.md)")
+        known = ", ".join(entry.name for entry in entries) or "none"
+        raise ValueError(f"no {what} {name!r} is installed; installed: {known} (docs/new-device.md)")
     if len(found) > 1:
-        packages = " and ".join(entry.dist.name if entry.dist else entry.value for entry in found)
-        raise ValueError(f"{packages} both install a {kind} {name!r}; uninstall one")
+        packages = " and ".join(entry.dist.name if entry.dist else "membrane-ctrl" for entry in found)
+        raise ValueError(f"{packages} both install a {what} {name!r}; uninstall one")
     try:
         return found[0].load()
-    except Exception as error:  # whatever its module does
+    except (Exception, SystemExit) as error:  # whatever its module does
         raise ValueError(
-            f"the {kind} {name} ({found[0].value}) does not load: {type(error).__name__}: {error}"
+            f"the {what} {name} ({found[0].value}) does not load: {type(error).__name__}: {error}"
         ) from error

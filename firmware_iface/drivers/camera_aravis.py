@@ -3,14 +3,12 @@
 Standards: GenICam SFNC 2.7 (features' names), GigE Vision 2.0, USB3 Vision 1.1; aravis 0.8 manual.
 
 A software trigger starts every exposure, so that a frame belongs to the pattern on the screen. An incomplete frame is
-counted as lost, and `grab` retakes it. After a timeout the stream is restarted, as a late frame would be taken for
+counted as lost. After a timeout the stream is restarted, as a late frame would be taken for
 the answer to the next trigger.
 """
 
 import ctypes
 import threading
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -29,6 +27,7 @@ _STREAM_READY_S = 0.2
 _AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = 0, 0, 0, 1  # arvenums.h, arvgvdevice.h, arvgvstream.h
 _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
+_REAL_TIME = roles.DriverClock()
 _GONE = (arv.NOT_CONNECTED, arv.TRANSFER_ERROR, arv.TIMEOUT)
 _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
@@ -46,23 +45,17 @@ class FrameCounts:
 class AravisCamera:
     """The camera; opened by the first exposure, and again by the next one after its link was lost.
 
-    A sensor of another size than `width_px` and `height_px` is refused; `now` and `sleep` are the run's clock.
-    `counts` has the results of the triggers.
+    A sensor of another size is refused; `counts` has the results of the triggers.
     """
 
     def __init__(
-        self,
-        config: settings.AravisCameraConfig,
-        width_px: int,
-        height_px: int,
-        now: roles.Clock = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, config: settings.AravisCameraConfig, sensor: roles.SensorFormat, clock: roles.DriverClock = _REAL_TIME
     ) -> None:
         self.config = config
         self.counts = FrameCounts()
         self._name = f"camera {config.camera}" if config.camera else "camera"
-        self._size = (width_px, height_px)
-        self._now, self._sleep = now, sleep
+        self._size = (sensor.width_px, sensor.height_px)
+        self._now, self._sleep = clock.now, clock.sleep
         self._camera: int | None = None
         self._stream: int | None = None
         self._opened = False
@@ -138,20 +131,6 @@ class AravisCamera:
             library.call("arv_stream_push_buffer", self._stream, buffer)
         self.counts.taken += 1
         return frame
-
-    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
-        """One exposure, in `out` (height, width) or a new array; taken again when it is lost.
-
-        Raises LinkError (no camera, or three frames lost in a row).
-        """
-        for _ in range(roles.TRIES - 1):
-            self.expose(out)
-            try:
-                return self.fetch()
-            except roles.FrameLostError:
-                continue
-        self.expose(out)
-        return self.fetch()
 
     def close(self) -> None:
         """Release the camera. Never raises."""

@@ -8,7 +8,6 @@ A folder of pictures: one file per exposure, in order of name, repeated endlessl
 camera, with pictures of a bench or from `membrane-ctrl simulate`.
 """
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,6 +19,7 @@ from firmware_iface import roles, settings
 
 # One in the driver's queue, although its length is set to one, and one whose exposure has started
 _STALE_FRAMES = 2
+_REAL_TIME = roles.DriverClock()
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
 
 
@@ -45,18 +45,18 @@ class VideoCapture(Protocol):
 class UvcCamera:
     """The camera; opened by the first exposure, and again by the next one after it went away.
 
-    A sensor of another size is refused; `now` is the run's clock, `capture` makes the capture from the port.
+    A sensor of another size is refused; `capture` makes the capture from the port.
     """
 
     def __init__(
         self,
         config: settings.UvcCameraConfig,
-        width_px: int,
-        height_px: int,
-        now: roles.Clock = time.monotonic,
+        sensor: roles.SensorFormat,
+        clock: roles.DriverClock = _REAL_TIME,
         capture: Callable[[int | str], VideoCapture] = cv2.VideoCapture,  # type: ignore[assignment]  # the stubs differ
     ) -> None:
-        self._config, self._size, self._now, self._make = config, (width_px, height_px), now, capture
+        self._config, self._size = config, (sensor.width_px, sensor.height_px)
+        self._now, self._make = clock.now, capture
         self._capture: VideoCapture | None = None
 
     def open(self) -> roles.DeviceIdentity:
@@ -138,8 +138,10 @@ class FolderCamera:
     The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
     """
 
-    def __init__(self, folder: Path, width_px: int, height_px: int, now: roles.Clock = time.monotonic) -> None:
-        self._folder, self._size, self._now = folder, (height_px, width_px), now
+    def __init__(
+        self, config: settings.FolderCameraConfig, sensor: roles.SensorFormat, clock: roles.DriverClock = _REAL_TIME
+    ) -> None:
+        self._folder, self._size, self._now = Path(config.folder).expanduser(), sensor.shape, clock.now
         self._files: list[Path] = []
         self._next = 0
 

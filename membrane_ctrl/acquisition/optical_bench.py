@@ -2,18 +2,23 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from firmware_iface import display, roles, settings
-from firmware_iface.drivers import camera_aravis, camera_opencv, screen_pygame
+from firmware_iface import display, drivers, roles
+from firmware_iface.guarded_camera import GuardedCamera
+from firmware_iface.pattern_screen import PatternScreen
+from firmware_iface.settings import ExternalCameraConfig, ExternalScreenConfig, ScreenSection
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.instruments import driver_loading
 from membrane_ctrl.metrology.phase import full_sequence
 from membrane_ctrl.metrology.track.live import crossed_patterns
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.sim.optics.camera import TwinOptics
 
+_CAMERA, _SCREEN = "devices.camera", "devices.screen"  # for messages
 # Longer than any suitable display takes
 LONG_S = 0.5
 # Frame after frame for this long, three times per direction, as refresh and exposure are not synchronised
@@ -28,12 +33,7 @@ class DisplayTest:
     """
 
     def __init__(
-        self,
-        screen: screen_pygame.PygameScreen,
-        camera: roles.Camera,
-        clock: CycleClock,
-        width_px: int,
-        height_px: int,
+        self, screen: PatternScreen, camera: roles.Camera, clock: CycleClock, width_px: int, height_px: int
     ) -> None:
         self._screen, self._camera, self._clock = screen, camera, clock
         self._size = (height_px, width_px)
@@ -112,7 +112,7 @@ def told(name: str, measure: Callable[[], str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class OpticalBench:
-    """A camera and its target."""
+    """A camera and its target; the twin's own camera and screen need not be opened."""
 
     camera: Any
     screen: Any
@@ -126,43 +126,82 @@ class OpticalBench:
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
     """The drivers named in `[devices.camera]` and `[devices.screen]`, not yet open.
 
-    Raises LinkError if the configuration names none, or the patterns do not fit on the screen.
+    Raises LinkError if the configuration names none, or the patterns do not fit on the screen; InputError for a
+    driver that is not installed, does not load or refuses its settings.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
         raise roles.LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
     camera = _camera(config, devices.camera, clock)
     if devices.screen is None:
-        return OpticalBench(camera, camera)  # a folder of frames is both
-    screen, pattern = devices.screen, config.optics.pattern
-    try:
-        raster = display.ScreenRaster(
-            screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
+        return OpticalBench(camera, camera.driver)  # its pictures are those of the patterns
+    return OpticalBench(camera, _screen(config, devices.screen, clock))
+
+
+def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> OpticalBench:
+    """The twin's camera and screen; drivers of other packages that have an emulator take their places.
+
+    Raises InputError for a driver or emulator that does not load or refuses its settings.
+    """
+    camera: Any = optics.camera
+    screen: Any = optics.screen
+    devices = config.devices
+    if devices is None:
+        return OpticalBench(camera, screen)
+    if isinstance(devices.screen, ExternalScreenConfig) and drivers.has_emulator(
+        devices.screen.name, drivers.SCREENS
+    ):
+        raster = _raster(config, devices.screen)
+        panel = driver_loading.make_emulator(
+            devices.screen, _SCREEN, drivers.SCREENS, lambda levels: optics.screen.show_picture(levels, raster)
         )
-    except ValueError as error:
-        raise roles.LinkError(f"devices.screen: {error}") from None
-    patterns = full_sequence(pattern)
-    if config.shape.mode == "track":
-        patterns += crossed_patterns(config.shape.track_periods)
-    shown = screen_pygame.ScreenSettings(raster, patterns, screen.display)
-    return OpticalBench(camera, screen_pygame.PygameScreen(shown, now=clock.now, sleep=clock.sleep))
+        screen = _screen(config, devices.screen, clock, panel)
+    if isinstance(devices.camera, ExternalCameraConfig) and drivers.has_emulator(
+        devices.camera.name, drivers.CAMERAS
+    ):
+        sensor = driver_loading.make_emulator(devices.camera, _CAMERA, drivers.CAMERAS, optics.view)
+        camera = _camera(config, devices.camera, clock, sensor)
+    return OpticalBench(camera, screen)
 
 
 def exposure_s(config: Config) -> float:
     """Exposure time of a frame; 0 for cameras that do not state it."""
     camera = config.devices.camera if config.devices is not None else None
-    return camera.exposure_ms / 1e3 if isinstance(camera, settings.AravisCameraConfig) else 0.0
+    return 0.0 if camera is None else camera.frame_exposure_s or 0.0
 
 
-def _camera(config: Config, section: settings.CameraConfig, clock: CycleClock) -> Any:
-    size_px = config.optics.camera.width_px, config.optics.camera.height_px
-    match section:
-        case settings.AravisCameraConfig():
-            return camera_aravis.AravisCamera(section, *size_px, clock.now, clock.sleep)
-        case settings.UvcCameraConfig():
-            return camera_opencv.UvcCamera(section, *size_px, clock.now)
-        case settings.FolderCameraConfig():
-            return camera_opencv.FolderCamera(Path(section.folder).expanduser(), *size_px, clock.now)
+def _camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> GuardedCamera:
+    """The camera of a table; `library` stands for the library that its driver calls."""
+    stated = config.optics.camera
+    sensor = roles.SensorFormat(stated.width_px, stated.height_px, stated.bits)
+    waits = roles.DriverClock(clock.now, clock.sleep)
+    driver = driver_loading.make_driver(section, _CAMERA, drivers.CAMERAS, sensor, waits, *library)
+    try:
+        return GuardedCamera(driver, sensor, clock.now, f"camera {driver_loading.name_of(section)}")
+    except ValueError as error:
+        raise InputError(f"{_CAMERA}: {error}") from None
+
+
+def _screen(config: Config, section: Any, clock: CycleClock, *library: Any) -> PatternScreen:
+    """The screen of a table, as `_camera`."""
+    patterns = full_sequence(config.optics.pattern)
+    if config.shape.mode == "track":
+        patterns += crossed_patterns(config.shape.track_periods)
+    shown = driver_loading.make_driver(section, _SCREEN, drivers.SCREENS, *library)
+    waits = roles.DriverClock(clock.now, clock.sleep)
+    name = f"screen {driver_loading.name_of(section)}"
+    return PatternScreen(shown, _raster(config, section), patterns, waits, name)
+
+
+def _raster(config: Config, screen: ScreenSection) -> display.ScreenRaster:
+    """The screen's pixels and the pattern region. Raises LinkError if the region does not fit."""
+    pattern = config.optics.pattern
+    try:
+        return display.ScreenRaster(
+            screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
+        )
+    except ValueError as error:
+        raise roles.LinkError(f"devices.screen: {error}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,15 +214,17 @@ class BenchFindings:
 
 
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
-    """Connect the camera and screen of `configured_bench`, and measure the screen with the camera.
+    """Connect the camera and screen, and measure the screen with the camera.
 
     Problems found do not stop a run, as each cycle is judged. Raises LinkError if camera or screen is missing or
     unusable.
     """
-    identity = bench.camera.open()
-    who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
+    who = ""
+    if isinstance(bench.camera, GuardedCamera):
+        identity = bench.camera.open()
+        who = " ".join(part for part in (identity.kind, identity.serial, identity.detail) if part)
     section = config.devices.screen if config.devices is not None else None
-    if section is None:
+    if section is None or not isinstance(bench.screen, PatternScreen):
         return BenchFindings(who)
     screen = bench.screen
     screen.open()
@@ -202,13 +243,13 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
 
 
 def _exposure(config: Config, test: DisplayTest) -> str:
-    camera = config.devices.camera if config.devices is not None else None
-    if not isinstance(camera, settings.AravisCameraConfig):  # other cameras' exposure has no unit
+    exposure_ms = 1000.0 * exposure_s(config)
+    if not exposure_ms:  # the remedy would have no unit
         return ""
-    return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, camera.exposure_ms))
+    return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, exposure_ms))
 
 
-def _settle(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: list[str]) -> str:
+def _settle(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
     found = test.settling()
     screen.settle_s = found.settle_s
     measured.append(
@@ -218,7 +259,7 @@ def _settle(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: lis
     return ""
 
 
-def _linearise(screen: screen_pygame.PygameScreen, test: DisplayTest, measured: list[str]) -> str:
+def _linearise(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
     curve = test.response()
     screen.linearise(curve)
     measured.append(f"screen response corrected (gamma {curve.gamma:.2f})")

@@ -147,8 +147,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
             bench = _twin_bench(spec.truth, config, plan, clock, remote, stack)
         signal.signal(child.STOP, lambda number, frame: remote.end())
         stack.callback(bench.close)
-        if spec.truth is None:
-            _open(bench, config, clock, remote)
+        _open(bench, config, clock, remote)
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
@@ -255,7 +254,7 @@ def _twin_bench(
     remote: process.Remote,
     stack: ExitStack,
 ) -> optical_bench.OpticalBench:
-    """The twin's camera and screen, once its bench has published the film's position."""
+    """Camera and screen at the twin's mirror, once its bench has published the film's position."""
     truth = stack.enter_context(closing(TwinTruth(address)))
     while not truth.known and not remote.stop:
         remote.listen(_TRUTH_LOOK_S)
@@ -263,7 +262,7 @@ def _twin_bench(
     if not remote.stop:
         _warm_up(config, plan, truth(), clock)
         optics.prepare()
-    return optical_bench.OpticalBench(optics.camera, optics.screen)
+    return optical_bench.emulated_bench(config, clock, optics)
 
 
 def _warm_up(config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
@@ -282,7 +281,8 @@ def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock
     while not remote.stop:
         try:
             found = optical_bench.open_bench(bench, config, clock)
-            for line in (f"camera: {found.camera}", *found.measured, *found.problems):
+            who = (f"camera: {found.camera}",) if found.camera else ()
+            for line in (*who, *found.measured, *found.problems):
                 remote.report("preparing", line)
             return
         except LinkError as error:

@@ -158,7 +158,7 @@ def new(
     to: Annotated[Path, typer.Option(help="Folder in which NAME-driver is made.")] = Path(),
 ) -> int:
     """Write a driver for an instrument of your own, with its emulator and tests, as a package to install."""
-    from membrane_ctrl.commissioning.devices import write_package
+    from membrane_ctrl.commissioning.new_driver import write_package
 
     return write_package(name, role, to)
 

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
-from membrane_ctrl.acquisition import optical_bench, session
+from membrane_ctrl.acquisition import driver_check, optical_bench, session
 from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.bridge_access import describe_bridges
@@ -26,7 +26,7 @@ from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
-from membrane_ctrl.instruments import bench, lock_store
+from membrane_ctrl.instruments import bench, driver_loading, lock_store
 from membrane_ctrl.model import errors, plain_json, telemetry, terminal
 from membrane_ctrl.model.clock import RunClock
 
@@ -58,6 +58,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     findings = dict.fromkeys(require_sound(config, source))  # before touching any device
     if config.devices is not None:
         bench.require_places(config.devices)
+        driver_check.require_optics(config.devices)
     probes, circuits = _probed(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
@@ -302,12 +303,13 @@ def probe_optics(config: Config) -> list[DeviceProbe]:
     if config.devices is None or config.devices.camera is None:
         return []
     clock = session.WaitingClock(RunClock.start())
+    name = driver_loading.name_of(config.devices.camera)
     try:
         optics = optical_bench.configured_bench(config, clock)
     except roles.LinkError as error:
-        return [DeviceProbe("camera", config.devices.camera.driver, problem=str(error))]
-    name = _where(optics)
+        return [DeviceProbe("camera", name, problem=str(error))]
     try:
+        name = _where(optics)
         found = optical_bench.open_bench(optics, config, clock)
         p50_ms, p99_ms, median_adu = _grab(optics)
     except roles.LinkError as error:

@@ -146,15 +146,27 @@ def explained(word: str) -> tuple[TableHelp, ...]:
 
 
 def _of_other_packages(word: str) -> list[TableHelp]:
-    """Return the table of an installed driver of this name, whose package is loaded. Raises InputError."""
-    if all(entry.name != word for entry in drivers.installed()):
-        return []
-    try:
-        driver = drivers.load(word)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-    places = [(f"devices.{role}", None) for role, (read, _) in READS.items() if hasattr(driver, read)]
-    return [replace(_table(json_schema(driver.Settings), places), driver="external")]
+    """Return the table of each installed driver of this name, whose package is loaded. Raises InputError."""
+    found = []
+    for kind in drivers.KINDS:
+        if all(entry.name != word for entry in drivers.list_installed(kind.group)):
+            continue
+        try:
+            driver = drivers.load_driver(word, kind)
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        places = [(place, None) for place in _places_of_driver(driver, kind)]
+        found.append(replace(_table(json_schema(driver.Settings), places), driver="external"))
+    return found
+
+
+def _places_of_driver(driver: Any, kind: drivers.DriverKind) -> list[str]:
+    """Return the tables in which a driver may be named."""
+    if kind is drivers.CAMERAS:
+        return ["devices.camera"]
+    if kind is drivers.SCREENS:
+        return ["devices.screen"]
+    return [f"devices.{role}" for role, (read, _) in READS.items() if hasattr(driver, read)]
 
 
 def unit_of(name: str) -> str:
@@ -194,16 +206,29 @@ def _shown(default: Any) -> str:
 
 
 def _texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
-    """Return the text below each key of the schema's classes, read from their sources."""
-    found = {}
-    for module in filter(None, {inspect.getmodule(section) for section in _classes(root)}):
-        for node in ast.parse(inspect.getsource(module)).body:
-            body = node.body if isinstance(node, ast.ClassDef) else []
-            for key, text in pairwise(body):
-                if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
-                    continue
-                if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                    found[getattr(node, "name", ""), key.target.id] = " ".join(str(text.value.value).split())
+    """Return the text below each key of the schema's classes, or of the class that defines the key for them."""
+    found: dict[tuple[str, str], str] = {}
+    for section in _classes(root):
+        for base in reversed(section.__mro__):
+            if issubclass(base, BaseModel) and base is not BaseModel:
+                below = _texts_of_module(inspect.getmodule(base)).get(base.__name__, {})
+                found |= {(section.__name__, key): text for key, text in below.items()}
+    return found
+
+
+@cache
+def _texts_of_module(module: Any) -> dict[str, dict[str, str]]:
+    """Return the text below each key of a module's classes, by class, read from its source."""
+    found: dict[str, dict[str, str]] = {}
+    for node in ast.parse(inspect.getsource(module)).body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        texts = found.setdefault(node.name, {})
+        for key, text in pairwise(node.body):
+            if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
+                continue
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                texts[key.target.id] = " ".join(str(text.value.value).split())
     return found
 
 
@@ -218,7 +243,7 @@ def page() -> str:
     """docs/configuration.md."""
     lines = _PAGE.splitlines()
     for table in tables():
-        lines += ["", f"## {table.driver or table.places[0]}", "", f"`{table.title}`: {table.meaning}"]
+        lines += ["", f"## {_heading(table)}", "", f"`{table.title}`: {table.meaning}"]
         if table.keys:
             lines += [
                 "",
@@ -229,6 +254,16 @@ def page() -> str:
             cells = (f"`{key.name}`", key.unit, key.range, f"`{key.default}`", key.meaning, key.advice)
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join([*lines, ""])
+
+
+def _heading(table: TableHelp) -> str:
+    """Return a heading of the page, which names no other table."""
+    if not table.driver:
+        return table.places[0]
+    if sum(other.driver == table.driver for other in tables()) == 1:
+        return table.driver
+    devices = ", ".join(place.removeprefix("devices.") for place in table.places)
+    return f"{table.driver}: {devices}"
 
 
 _PAGE = """\

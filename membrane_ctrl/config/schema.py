@@ -63,7 +63,7 @@ class DevicesConfig(Section):
     barometer: settings.BarometerDriver | None = None
     thermometer: settings.ValueDriver | None = None
     camera: settings.CameraConfig | None = None
-    screen: settings.PygameScreenConfig | None = None
+    screen: settings.ScreenConfig | None = None
     interlocks: Annotated[tuple[settings.InterlockDriver, ...], Field(max_length=INTERLOCKS_MAX)] = ()
     """Circuits that must be closed for a hold, at most 32. Set it for emergency stop, door, oxygen monitor."""
 
@@ -121,7 +121,7 @@ class DevicesConfig(Section):
     def _camera_sees_a_screen(self) -> "DevicesConfig":
         if self.camera is None and self.screen is not None:
             raise ValueError("[devices.screen] needs a [devices.camera]")
-        if self.camera is not None and (self.screen is None) != isinstance(self.camera, settings.FolderCameraConfig):
+        if self.camera is not None and (self.screen is None) != self.camera.shows_patterns:
             raise ValueError("a camera needs a [devices.screen]; a folder of frames must not have one")
         return self
 
@@ -266,11 +266,9 @@ class Config(Section):
             )
         if self.web is not None and not self.port.enabled:
             raise ValueError("web: the page asks the control port: set port.enabled = true")
-        if self.devices is not None and isinstance(
-            self.devices.camera, settings.AravisCameraConfig | settings.UvcCameraConfig
-        ):
-            bits = self.devices.camera.bits
-            if bits != self.optics.camera.bits:
+        if self.devices is not None and self.devices.camera is not None:
+            bits = self.devices.camera.frame_bits
+            if bits not in (None, self.optics.camera.bits):
                 raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
         return self
 

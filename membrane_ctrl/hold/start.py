@@ -19,6 +19,7 @@ from pathlib import Path
 from firmware_iface.drivers.pump_board import NO_CLAIM
 from firmware_iface.roles import ALL_FAULTS, Bench, BenchReading, LinkError
 from firmware_iface.settings import GpioLineConfig
+from membrane_ctrl.acquisition import driver_check
 from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import server, sockets
@@ -76,6 +77,8 @@ def hold_mirror(options: HoldOptions) -> int:
         print(warning.line(options.source), file=sys.stderr)
     if options.config.devices is not None and (options.lab or not options.twin):
         _require_possible(options.config.devices, options.lab)
+        if options.config.shape.enabled:
+            driver_check.require_optics(options.config.devices)
     require_sendable(options.config.alarms)
     if options.config.web is not None and importlib.util.find_spec("nicegui") is None:
         raise errors.InputError("[web] needs NiceGUI: pip install 'membrane-ctrl[web]'")

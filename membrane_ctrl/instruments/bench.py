@@ -20,9 +20,9 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.links import modbus_rtu, serial_port
-from membrane_ctrl.config import device_places, toml_file
+from membrane_ctrl.config import device_places
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments import interlock_sources
+from membrane_ctrl.instruments import driver_loading, interlock_sources
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.terminal import one_line
 
@@ -67,24 +67,12 @@ def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLink
                 role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
             )
         case settings.ExternalConfig():
-            device = external(drivers.load(section.name), role, section)
+            device = driver_loading.make_driver(section, f"devices.{role}", drivers.SENSORS)
             if not hasattr(device, roles.READS[role][0]):
                 raise ValueError(f"the driver {section.name} has no {roles.READS[role][0]}, so it is no {role}")
             return device
         case _:
             return _SERIAL_DRIVERS[type(section)](section)
-
-
-def external(make: Any, role: str, section: settings.ExternalConfig, *more: Any) -> Any:
-    """Make another package's driver (or emulator) from its table. Raises InputError, ValueError."""
-    expected = getattr(drivers.load(section.name), "Settings", None)
-    if not (isinstance(expected, type) and issubclass(expected, settings.Section)):
-        raise ValueError(f"the driver {section.name} has no class Settings (docs/new-device.md)")
-    checked = toml_file.parse(section.keys, expected, f"devices.{role}")
-    try:
-        return make(checked, *more)
-    except Exception as error:  # whatever its code does
-        raise ValueError(f"the driver {section.name} cannot be made: {type(error).__name__}: {error}") from error
 
 
 def _bronkhorst(

@@ -72,7 +72,7 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
         try:
             bench = LiveBench(spec, writer)
             served, started = await _listening(bench, spec)
-        except ValueError as error:
+        except (ValueError, errors.InputError) as error:
             ready.send(BenchReport(error=str(error)))
             return
         except OSError as error:

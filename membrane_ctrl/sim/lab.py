@@ -23,7 +23,7 @@ from firmware_iface.emulators import (
 )
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import bench, driver_loading
 
 _GATEWAY_NO_RESPONSE = 11
 _PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa suits the mirror's 600 Pa
@@ -184,8 +184,9 @@ class Lab:
                 )
             case settings.ExternalConfig():
                 end = self._actuator(role) if role in self._outputs else self._sensor(role)
-                emulator = drivers.load(section.name, drivers.EMULATORS)
-                made: serial_device.SerialDevice = bench.external(emulator, role, section, end)
+                made: serial_device.SerialDevice = driver_loading.make_emulator(
+                    section, f"devices.{role}", drivers.SENSORS, end
+                )
                 return made
             case _:
                 raise AssertionError(section)

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.real_time
 
 PATIENCE_S = 300.0  # the kernels may have to be compiled
 SCREEN = {"width_px": 420, "height_px": 300, "pixel_mm": 1.6}
-SCREEN_TABLE = "[devices.screen]\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n"
+SCREEN_TABLE = '[devices.screen]\ndriver = "pygame"\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n'
 CONFIG = Config.model_validate(
     {
         "shape": {"period_s": 0.3, "frame_interval_s": 0.0},
@@ -41,7 +41,7 @@ CONFIG = Config.model_validate(
         "devices": {
             "board": "tcp://127.0.0.1:1",
             "camera": {"driver": "aravis", "camera": "127.0.0.1", "exposure_ms": 30, "packet_bytes": 8000},
-            "screen": {**SCREEN, "settle_ms": 50, "linearise": False, "self_test": False},
+            "screen": {"driver": "pygame", **SCREEN, "settle_ms": 50, "linearise": False, "self_test": False},
         },
     }
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.camera_aravis import AravisCamera
+from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.links import aravis
-from firmware_iface.roles import DeviceRefusedError, FrameLostError, LinkDownError, LinkError
+from firmware_iface.roles import DeviceRefusedError, FrameLostError, LinkDownError, LinkError, SensorFormat
 from firmware_iface.settings import AravisCameraConfig
 from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.machine_needs import program_path
@@ -22,6 +24,12 @@ pytestmark = pytest.mark.real_time
 
 WIDTH_PX, HEIGHT_PX = 306, 256
 SETTINGS = AravisCameraConfig(camera="127.0.0.1", exposure_ms=2.0, packet_bytes=8000, timeout_s=0.3)
+
+
+def guarded(config: AravisCameraConfig = SETTINGS, width_px: int = WIDTH_PX) -> GuardedCamera:
+    """The driver as the cycle uses it."""
+    sensor = SensorFormat(width_px, HEIGHT_PX, config.frame_bits)
+    return GuardedCamera(AravisCamera(config, sensor), sensor, time.monotonic, "camera aravis")
 
 
 class Sight:
@@ -53,15 +61,15 @@ def emulator(sight: Sight) -> Iterator[GigeCameraEmulator]:
 
 
 @pytest.fixture
-def camera(emulator: GigeCameraEmulator) -> Iterator[AravisCamera]:
-    opened = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
+def camera(emulator: GigeCameraEmulator) -> Iterator[GuardedCamera]:
+    opened = guarded()
     opened.open()
     yield opened
     opened.close()
 
 
 def test_identity_and_pixels(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
+    camera = guarded()
     identity = camera.open()
     assert (identity.kind, identity.serial) == ("Aravis Fake", "EMU1")
     out = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
@@ -71,18 +79,18 @@ def test_identity_and_pixels(emulator: GigeCameraEmulator, sight: Sight) -> None
         assert np.array_equal(out, sight.last)
     assert np.array_equal(camera.grab().pixels, sight.last)
     camera.close()
-    assert camera.counts.taken == 6
+    assert camera.driver.counts.taken == 6
     assert "6 taken" in camera.describe()["frames"]
 
 
-def test_every_frame_is_triggered_and_dated(camera: AravisCamera, emulator: GigeCameraEmulator) -> None:
+def test_every_frame_is_triggered_and_dated(camera: GuardedCamera, emulator: GigeCameraEmulator) -> None:
     before = emulator.exposures
     times = [camera.grab().time_s for _ in range(4)]
     assert emulator.exposures == before + 4
     assert all(later - earlier >= 0.002 for earlier, later in pairwise(times))
 
 
-def test_the_screen_may_change_between_expose_and_fetch(camera: AravisCamera, sight: Sight) -> None:
+def test_the_screen_may_change_between_expose_and_fetch(camera: GuardedCamera, sight: Sight) -> None:
     out = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     camera.expose(out)
     assert not out.any()  # nothing is written before it is fetched
@@ -94,7 +102,7 @@ def test_the_screen_may_change_between_expose_and_fetch(camera: AravisCamera, si
 
 
 def test_exposure_and_gain_arrive(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(SETTINGS.model_copy(update={"exposure_ms": 3.0, "gain_db": 4.0}), WIDTH_PX, HEIGHT_PX)
+    camera = guarded(SETTINGS.model_copy(update={"exposure_ms": 3.0, "gain_db": 4.0}))
     camera.grab()
     camera.close()
     assert set(sight.seen) == {(3.0, 4)}
@@ -111,7 +119,7 @@ def test_exposure_and_gain_arrive(emulator: GigeCameraEmulator, sight: Sight) ->
 )
 def test_pixel_formats(emulator: GigeCameraEmulator, sight: Sight, pixel_format: str, dtype: Any, top: int) -> None:
     sight.dtype, sight.top = dtype, top
-    camera = AravisCamera(SETTINGS.model_copy(update={"pixel_format": pixel_format}), WIDTH_PX, HEIGHT_PX)
+    camera = guarded(SETTINGS.model_copy(update={"pixel_format": pixel_format}))
     pixels = camera.grab().pixels
     camera.close()
     assert pixels.dtype == dtype
@@ -119,7 +127,7 @@ def test_pixel_formats(emulator: GigeCameraEmulator, sight: Sight, pixel_format:
 
 
 def test_incomplete_frames_are_counted_and_taken_again(
-    camera: AravisCamera, emulator: GigeCameraEmulator, sight: Sight
+    camera: GuardedCamera, emulator: GigeCameraEmulator, sight: Sight
 ) -> None:
     emulator.lose_packets(0.05)  # of 12 a frame: about half of the frames
     whole = 0
@@ -131,14 +139,14 @@ def test_incomplete_frames_are_counted_and_taken_again(
         whole += 1
         assert np.array_equal(pixels, sight.last)
     assert whole >= 3
-    assert camera.counts.incomplete + camera.counts.missing > 0
-    assert camera.counts.taken == whole
+    assert camera.driver.counts.incomplete + camera.driver.counts.missing > 0
+    assert camera.driver.counts.taken == whole
     emulator.lose_packets(0.0)
     assert np.array_equal(camera.grab().pixels, sight.last)
 
 
 def test_a_frame_that_never_comes_is_lost_not_waited_for(
-    camera: AravisCamera, emulator: GigeCameraEmulator, sight: Sight
+    camera: GuardedCamera, emulator: GigeCameraEmulator, sight: Sight
 ) -> None:
     emulator.lose_packets(1.0)
     camera.expose()
@@ -160,7 +168,8 @@ def test_a_frame_that_never_comes_is_lost_not_waited_for(
 def test_what_it_does_not_take_is_refused_in_one_line(
     emulator: GigeCameraEmulator, change: dict[str, Any], words: list[str]
 ) -> None:
-    camera = AravisCamera(SETTINGS.model_copy(update=change), change.pop("width_px", WIDTH_PX), HEIGHT_PX)
+    width_px = change.pop("width_px", WIDTH_PX)
+    camera = guarded(SETTINGS.model_copy(update=change), width_px)
     if not words:
         camera.open()
         camera.close()
@@ -173,27 +182,27 @@ def test_what_it_does_not_take_is_refused_in_one_line(
     assert "\n" not in message
 
 
-def test_in_use_by_another(camera: AravisCamera) -> None:
+def test_in_use_by_another(camera: GuardedCamera) -> None:
     with pytest.raises(LinkError, match=r"in use by another program.*close it"):
-        AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX).open()
+        guarded().open()
     camera.grab()  # the first one is not disturbed
 
 
-def test_a_buffer_of_another_size_is_a_mistake_of_the_caller(camera: AravisCamera) -> None:
-    with pytest.raises(ValueError, match="expected"):
+def test_a_buffer_of_another_size_is_a_mistake_of_the_caller(camera: GuardedCamera) -> None:
+    with pytest.raises(LinkError, match=r"fetch: ValueError: camera gives .* expected"):
         camera.grab(np.zeros((HEIGHT_PX, WIDTH_PX + 1), np.uint8))
     camera.grab()
 
 
 def test_replug(emulator: GigeCameraEmulator, sight: Sight) -> None:
-    camera = AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX)
+    camera = guarded()
     camera.grab()
     emulator.unplug()
     with pytest.raises(LinkDownError, match="plugged in"):
         camera.grab()
     emulator.plug_in()
     assert np.array_equal(camera.grab().pixels, sight.last)
-    assert camera.counts.reconnects == 1
+    assert camera.driver.counts.reconnects == 1
     camera.close()
 
 
@@ -202,7 +211,7 @@ def test_discovery_names_it(emulator: GigeCameraEmulator) -> None:
     assert [(camera.vendor, camera.model, camera.camera_id) for camera in found] == [
         ("Aravis", "Fake", "Aravis-Fake-EMU1")
     ]
-    named = AravisCamera(SETTINGS.model_copy(update={"camera": found[0].camera_id}), WIDTH_PX, HEIGHT_PX)
+    named = guarded(SETTINGS.model_copy(update={"camera": found[0].camera_id}))
     named.grab()
     named.close()
 
@@ -221,6 +230,6 @@ def test_without_the_library_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch
     aravis.aravis.cache_clear()
     try:
         with pytest.raises(LinkError, match=r"apt install libaravis-0\.8-0"):
-            AravisCamera(SETTINGS, WIDTH_PX, HEIGHT_PX).open()
+            guarded().open()
     finally:
         aravis.aravis.cache_clear()

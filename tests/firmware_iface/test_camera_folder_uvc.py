@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.camera_opencv import FolderCamera, UvcCamera
-from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError, Pattern
-from firmware_iface.settings import UvcCameraConfig
+from firmware_iface.roles import DeviceRefusedError, DriverClock, LinkDownError, LinkError, Pattern, SensorFormat
+from firmware_iface.settings import FolderCameraConfig, UvcCameraConfig
+
+CLOCK = DriverClock(lambda: 3.5)
+
+
+def of_folder(path: Path, width_px: int = 6) -> FolderCamera:
+    return FolderCamera(FolderCameraConfig(folder=str(path)), SensorFormat(width_px, 4), CLOCK)
 
 
 @pytest.fixture
@@ -22,14 +28,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_folder_goes_round_in_the_order_of_names(folder: Path) -> None:
-    camera = FolderCamera(folder, 6, 4, now=lambda: 3.5)
+    camera = of_folder(folder)
     out = np.zeros((4, 6), np.uint8)
     assert [int(camera.grab(out).pixels[0, 0]) for _ in range(4)] == [0, 1, 2, 0]
     assert camera.grab().time_s == 3.5
 
 
 def test_a_folder_is_its_own_screen(folder: Path) -> None:
-    camera = FolderCamera(folder, 6, 4)
+    camera = of_folder(folder)
     camera.show(Pattern("sin", "x", 0))
     assert camera.grab().pixels[0, 0] == 2
     camera.show(Pattern("black"))
@@ -38,14 +44,14 @@ def test_a_folder_is_its_own_screen(folder: Path) -> None:
 
 def test_a_folder_with_other_pictures_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DeviceRefusedError, match=r"6 x 4 pixels.*says 7 x 4"):
-        FolderCamera(folder, 7, 4).open()
+        of_folder(folder, 7).open()
     with pytest.raises(LinkError, match="no pictures"):
-        FolderCamera(tmp_path / "nothing", 6, 4).open()
+        of_folder(tmp_path / "nothing").open()
     with pytest.raises(LinkError, match="uint16"):
-        FolderCamera(folder, 6, 4).grab(np.zeros((4, 6), np.uint16))
+        of_folder(folder).grab(np.zeros((4, 6), np.uint16))
     (folder / "black.png").write_bytes(b"no picture")
     with pytest.raises(LinkError, match="cannot be read"):
-        FolderCamera(folder, 6, 4).open()
+        of_folder(folder).open()
 
 
 class FakeCapture:
@@ -82,7 +88,7 @@ def uvc(config: UvcCameraConfig, width_px: int = 6) -> tuple[UvcCamera, list[Fak
         made.append(FakeCapture(port))
         return made[-1]
 
-    return UvcCamera(config, width_px, 4, now=lambda: 1.0, capture=make), made
+    return UvcCamera(config, SensorFormat(width_px, 4), CLOCK, make), made
 
 
 def test_uvc_throws_away_what_was_begun_before() -> None:

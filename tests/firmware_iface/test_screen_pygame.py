@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from firmware_iface.display import DisplayResponse, ScreenRaster, checkerboard, pattern_light
-from firmware_iface.drivers.screen_pygame import PygameScreen, ScreenSettings
-from firmware_iface.roles import DeviceRefusedError, LinkError, Pattern
+from firmware_iface.drivers.screen_pygame import PygameDisplay
+from firmware_iface.pattern_screen import PatternScreen
+from firmware_iface.roles import DeviceRefusedError, DriverClock, LinkError, Pattern
+from firmware_iface.settings import PygameScreenConfig
 from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
@@ -43,10 +45,16 @@ def framebuffer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield file
 
 
+def made(time: Time, raster: ScreenRaster = RASTER, display: int = 0) -> PatternScreen:
+    """The display as the cycle uses it."""
+    size = {"width_px": raster.width_px, "height_px": raster.height_px, "pixel_mm": raster.pixel_mm}
+    shown = PygameDisplay(PygameScreenConfig(**size, display=display))
+    return PatternScreen(shown, raster, PATTERNS, DriverClock(time.now, time.sleep), "screen pygame")
+
+
 @pytest.fixture
-def screen(framebuffer: Path) -> Iterator[PygameScreen]:
-    time = Time()
-    shown = PygameScreen(ScreenSettings(RASTER, PATTERNS), now=time.now, sleep=time.sleep)
+def screen(framebuffer: Path) -> Iterator[PatternScreen]:
+    shown = made(Time())
     yield shown
     shown.close()
 
@@ -55,7 +63,7 @@ def levels(pattern: Pattern) -> np.ndarray:
     return np.rint(255 * pattern_light(pattern, RASTER).astype(np.float64)).astype(np.uint8)
 
 
-def test_every_pattern_is_on_the_screen_byte_for_byte(screen: PygameScreen, framebuffer: Path) -> None:
+def test_every_pattern_is_on_the_screen_byte_for_byte(screen: PatternScreen, framebuffer: Path) -> None:
     screen.open()
     for pattern in PATTERNS:
         screen.show(pattern)
@@ -64,12 +72,12 @@ def test_every_pattern_is_on_the_screen_byte_for_byte(screen: PygameScreen, fram
         assert np.array_equal(seen, np.repeat(levels(pattern)[:, :, None], 3, axis=2)), pattern.name
 
 
-def test_a_checkerboard_is_not_scaled(screen: PygameScreen, framebuffer: Path) -> None:
+def test_a_checkerboard_is_not_scaled(screen: PatternScreen, framebuffer: Path) -> None:
     screen.show_levels(checkerboard(WIDTH_PX, HEIGHT_PX))
     assert np.array_equal(screenshot(framebuffer)[:, :, 1], checkerboard(WIDTH_PX, HEIGHT_PX))
 
 
-def test_light_is_made_linear(screen: PygameScreen, framebuffer: Path) -> None:
+def test_light_is_made_linear(screen: PatternScreen, framebuffer: Path) -> None:
     ramp = np.linspace(0, 255, 65)
     screen.open()
     screen.linearise(DisplayResponse(ramp, (ramp / 255) ** 2.2))
@@ -82,7 +90,8 @@ def test_light_is_made_linear(screen: PygameScreen, framebuffer: Path) -> None:
 
 def test_show_waits_until_it_is_settled(framebuffer: Path) -> None:
     time = Time()
-    screen = PygameScreen(ScreenSettings(RASTER, PATTERNS, settle_s=0.08), now=time.now, sleep=time.sleep)
+    screen = made(time)
+    screen.settle_s = 0.08
     screen.open()
     screen.show(PATTERNS[0])
     assert time.now_s == pytest.approx(0.08)
@@ -99,7 +108,7 @@ def test_show_waits_until_it_is_settled(framebuffer: Path) -> None:
 @pytest.mark.parametrize("size", [(WIDTH_PX - 1, HEIGHT_PX), (WIDTH_PX, HEIGHT_PX + 2), (680, 512)])
 def test_another_size_is_refused_in_one_line(framebuffer: Path, size: tuple[int, int]) -> None:
     raster = ScreenRaster(*size, 0.25, periods=4, period_mm=14.0)
-    screen = PygameScreen(ScreenSettings(raster, PATTERNS))
+    screen = made(Time(), raster)
     with pytest.raises(DeviceRefusedError) as refused:
         screen.open()
     message = str(refused.value)
@@ -109,9 +118,9 @@ def test_another_size_is_refused_in_one_line(framebuffer: Path, size: tuple[int,
     assert "\n" not in message
 
 
-def test_what_is_not_there_is_said(framebuffer: Path, screen: PygameScreen) -> None:
+def test_what_is_not_there_is_said(framebuffer: Path, screen: PatternScreen) -> None:
     with pytest.raises(LinkError, match="there are 1 displays"):
-        PygameScreen(ScreenSettings(RASTER, PATTERNS, display=3)).open()
+        made(Time(), display=3).open()
     with pytest.raises(LinkError, match="'x_sin_9' was not prepared"):
         screen.begin(Pattern("sin", "x", 9))
 
@@ -119,16 +128,16 @@ def test_what_is_not_there_is_said(framebuffer: Path, screen: PygameScreen) -> N
 def test_no_display_names_the_remedy(framebuffer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DISPLAY", ":9999")
     with pytest.raises(LinkError, match="DISPLAY"):
-        PygameScreen(ScreenSettings(RASTER, PATTERNS)).open()
+        made(Time()).open()
 
 
 def test_without_pygame_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(LinkError, match=r"membrane-ctrl\[screen\]"):
-        PygameScreen(ScreenSettings(RASTER, PATTERNS)).open()
+        made(Time()).open()
 
 
-def test_it_opens_again_after_it_was_closed(screen: PygameScreen, framebuffer: Path) -> None:
+def test_it_opens_again_after_it_was_closed(screen: PatternScreen, framebuffer: Path) -> None:
     screen.show(PATTERNS[0])
     screen.close()
     screen.close()

@@ -9,13 +9,15 @@ from typing import Protocol
 
 import numpy as np
 
-from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
+from firmware_iface.display import ScreenRaster
+from firmware_iface.roles import Frame, Levels, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.disturbances import Disturber, DrumMode, Nodes, drummed
 from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms, typical_film
 from membrane_ctrl.sim.optics.shade import (
     Light,
+    PanelPicture,
     cubic_weights,
     level_table,
     node_positions,
@@ -23,6 +25,7 @@ from membrane_ctrl.sim.optics.shade import (
     normal_quantiles,
     shade,
     shade_crossed,
+    shade_panel,
     vignetting,
 )
 from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
@@ -32,6 +35,8 @@ _NODE_MM = 4.6
 # Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only to 2e-5 rad
 _CELL_UM = 100.0
 _KEPT_TRACES = 8
+_DARK = Pattern("black")
+_NO_PATTERN = Pattern("picture")  # of a panel whose pixels are given
 
 
 @dataclass
@@ -88,13 +93,13 @@ class OpticsRenderer:
 
     def render(
         self,
-        pattern: Pattern,
+        shown: Pattern | PanelPicture,
         displacement_um: float,
         out: Pixels | None = None,
         gain: float = 1.0,
         time_s: float = 0.0,
     ) -> Pixels:
-        """The picture of one pattern, (H, W), at a displacement; `gain` is the exposure over the nominal one.
+        """The picture of what is shown, (H, W), at a displacement; `gain` is the exposure over the nominal one.
 
         `out` (as of `blank`) is filled and returned; otherwise a new array is made. The vibrations are those of
         `time_s`. Raises ValueError if the pattern is unknown or `out` has another shape or type.
@@ -107,13 +112,14 @@ class OpticsRenderer:
                 f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, {camera.width_px}) {depth}"
             )
         self._pictures += 1
-        paint = self._crossed(pattern, gain) if pattern.role == "crossed" else self._striped(pattern, gain)
+        paint = self._painter(shown, gain)
         nodes, times_s = self._nodes(displacement_um), np.array([[time_s]])
         if self._disturber is not None:
             nodes, times_s = nodes + self._disturber.rays(time_s), self._disturber.row_times_s(time_s)
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
         if self._disturber is not None:
+            pattern = shown if isinstance(shown, Pattern) else _NO_PATTERN
             nodes = np.concatenate([nodes, self._disturber.light(time_s, pattern)])
         seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
@@ -121,6 +127,27 @@ class OpticsRenderer:
         paint(nodes, seed, picture, 0, middle)
         other.result()
         return picture
+
+    def _painter(self, shown: Pattern | PanelPicture, gain: float) -> Callable[..., None]:
+        """What shades rows of a picture of what is shown."""
+        if isinstance(shown, PanelPicture):
+            return self._pixelled(shown, gain)
+        return self._crossed(shown, gain) if shown.role == "crossed" else self._striped(shown, gain)
+
+    def _pixelled(self, panel: PanelPicture, gain: float) -> Callable[..., None]:
+        """Shades rows of a picture of a panel's pixels."""
+        noise_adu, radius_mm = self.optics.camera.noise_adu, self.film.radius_mm
+        dark, white, full = self._levels(gain)
+        scale = np.array([dark, white, self.light.leak, full])
+        light, places = panel.light_of_pixels(self.light), panel.places
+
+        def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
+            noise = normal_quantiles(), noise_adu, seed
+            shade_panel(
+                nodes, self._weights, radius_mm, places, light, scale, self._loss, noise, picture, start, stop
+            )
+
+        return paint
 
     def _striped(self, pattern: Pattern, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of a pattern along one axis."""
@@ -285,7 +312,7 @@ class TwinOptics:
 
     def prepare(self) -> None:
         """Trace the film where it is and take one picture, so that the first real one comes at the usual speed."""
-        self._expose(Pattern("black"), None)
+        self._expose(_DARK, None)
 
     @property
     def film(self) -> FilmShape:
@@ -298,10 +325,14 @@ class TwinOptics:
             raise LinkError("twin camera: the screen shows nothing: show a pattern first")
         return self._expose(self.screen.shown, out)
 
-    def _expose(self, pattern: Pattern, out: Pixels | None) -> Frame:
+    def view(self) -> Pixels:
+        """What the sensor of an emulated camera sees now; before the first picture the screen is dark."""
+        return self._expose(self.screen.shown or _DARK, None).pixels
+
+    def _expose(self, shown: Pattern | PanelPicture, out: Pixels | None) -> Frame:
         renderer = self._looked()
         time_s = self._clock.now()
-        return Frame(renderer.render(pattern, self._truth().displacement_um, out, time_s=time_s), time_s)
+        return Frame(renderer.render(shown, self._truth().displacement_um, out, time_s=time_s), time_s)
 
     def _looked(self) -> OpticsRenderer:
         if self._renderer is None:
@@ -326,11 +357,15 @@ class TwinScreen:
     """Role Screen: lit and settled at once."""
 
     def __init__(self) -> None:
-        self.shown: Pattern | None = None
+        self.shown: Pattern | PanelPicture | None = None
 
     def show(self, pattern: Pattern) -> None:
         """Show the pattern."""
         self.shown = pattern
+
+    def show_picture(self, levels: Levels, raster: ScreenRaster) -> None:
+        """Show the pixels that an emulated display has got."""
+        self.shown = PanelPicture(levels, raster)
 
     def close(self) -> None:
         """Go dark."""

@@ -1,0 +1,133 @@
+"""A camera for the measurement cycle, whichever its driver: opened when needed, every frame checked.
+
+A driver takes a frame in one call (`grab`), or triggers (`expose`) and transfers (`fetch`) in two. This class offers
+all three. Whatever the driver raises becomes a LinkError with one line; after any failure but a lost frame the driver
+is closed, and opened again by the next exposure.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from firmware_iface.driver_calls import call_driver, close_driver
+from firmware_iface.roles import (
+    TRIES,
+    Camera,
+    Clock,
+    DeviceIdentity,
+    ExposingCamera,
+    Frame,
+    FrameLostError,
+    LinkError,
+    OpticalDevice,
+    Pixels,
+    SensorFormat,
+)
+
+# A camera's clock, converted to the run's clock, may be off by this; a frame of an earlier trigger is older
+_CLOCK_TOLERANCE_S = 0.005
+
+
+class GuardedCamera:
+    """The role ExposingCamera on a driver; `name` begins its messages.
+
+    Raises ValueError if the driver is no camera.
+    """
+
+    def __init__(self, driver: OpticalDevice, sensor: SensorFormat, now: Clock, name: str) -> None:
+        self._overlaps = isinstance(driver, ExposingCamera)
+        if not self._overlaps and not isinstance(driver, Camera):
+            raise ValueError(f"{name}: the driver has neither grab nor expose and fetch, so it is no camera")
+        self.driver, self._sensor, self._now, self._name = driver, sensor, now, name
+        self._opened = False
+        self._triggered_s = math.nan
+        self._grabbed: Frame | FrameLostError | None = None
+
+    def open(self) -> DeviceIdentity:
+        """Connect and apply the settings. Raises LinkError."""
+        if self._opened:
+            self.close()
+        identity: DeviceIdentity = self._call("open", returns=DeviceIdentity)
+        self._opened = True
+        return identity
+
+    def expose(self, out: Pixels | None = None) -> None:
+        """Trigger, and return when the exposure is over. Raises LinkError."""
+        if not self._opened:
+            self.open()
+        self._grabbed, self._triggered_s = None, self._now()
+        if self._overlaps:
+            self._call("expose", out)
+            return
+        try:
+            self._grabbed = self._call("grab", out, returns=Frame)
+        except FrameLostError as error:
+            self._grabbed = error
+
+    def fetch(self) -> Frame:
+        """The frame of the last `expose`. Raises FrameLostError (expose again), LinkError."""
+        if math.isnan(self._triggered_s):
+            raise LinkError(f"{self._name}: no exposure to fetch")
+        triggered_s, self._triggered_s = self._triggered_s, math.nan
+        found, self._grabbed = self._grabbed, None
+        if self._overlaps:
+            found = self._call("fetch", returns=Frame)
+        if isinstance(found, FrameLostError):
+            raise found
+        assert found is not None
+        self._check(found, triggered_s)
+        return found
+
+    def grab(self, out: Pixels | None = None) -> Frame:
+        """One exposure, taken again when it is lost. Raises LinkError (no camera, or three frames lost in a row)."""
+        for _ in range(TRIES - 1):
+            try:
+                self.expose(out)
+                return self.fetch()
+            except FrameLostError:
+                continue
+        self.expose(out)
+        return self.fetch()
+
+    def close(self) -> None:
+        """Release the camera. Never raises."""
+        self._opened, self._triggered_s, self._grabbed = False, math.nan, None
+        close_driver(self.driver)
+
+    def describe(self) -> dict[str, str]:
+        """For people: what the driver says."""
+        found: dict[str, str] = call_driver(self._name, self.driver, "describe", returns=dict)
+        return {"port": self._name, **found}
+
+    def _call(self, method: str, *arguments: object, returns: type[object] = object) -> Any:
+        try:
+            return call_driver(self._name, self.driver, method, *arguments, returns=returns)
+        except FrameLostError:
+            raise
+        except LinkError:
+            self.close()
+            raise
+
+    def _check(self, frame: Frame, triggered_s: float) -> None:
+        """Refuse a frame of another size or type, and one that was not exposed after its trigger."""
+        pixels, sensor = frame.pixels, self._sensor
+        if not isinstance(pixels, np.ndarray) or pixels.shape != sensor.shape or pixels.dtype != sensor.dtype:
+            self.close()
+            raise LinkError(
+                f"{self._name}: gave {_describe_array(pixels)}, [optics.camera] states {sensor.width_px} x "
+                f"{sensor.height_px} {sensor.dtype}"
+            )
+        earliest_s, latest_s = triggered_s - _CLOCK_TOLERANCE_S, self._now() + _CLOCK_TOLERANCE_S
+        if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
+            raise FrameLostError(
+                f"{self._name}: gave a frame of {frame.time_s} s for the trigger at {triggered_s:.3f} s: late, or "
+                "its time is not on the run's clock"
+            )
+
+
+def _describe_array(pixels: object) -> str:
+    if not isinstance(pixels, np.ndarray):
+        return type(pixels).__name__
+    size = " x ".join(str(length) for length in reversed(pixels.shape))
+    return f"{size} {pixels.dtype}"

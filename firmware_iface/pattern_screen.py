@@ -1,0 +1,98 @@
+"""A screen: shows patterns on any display, corrected for its response, and waits until they are settled.
+
+Patterns are rendered once, when the screen is opened. A display returns when a picture is queued, not when it is lit:
+`wait` lasts for the settle time, which `firmware_iface.display` measures.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from firmware_iface.display import DisplayResponse, ScreenRaster, linear_response, pattern_light
+from firmware_iface.driver_calls import call_driver, close_driver
+from firmware_iface.roles import DeviceIdentity, Display, DriverClock, Levels, LinkError, Pattern
+
+SETTLE_S = 0.3  # until it is measured
+
+
+class PatternScreen:
+    """The role Screen on a display, from `open` to `close`.
+
+    `response` makes the patterns' light linear; `wait` lasts for `settle_s` from the command on, which may be set.
+    Whatever the display's driver raises becomes a LinkError that begins with `name`, and the display is opened again
+    by the next picture.
+    """
+
+    def __init__(
+        self, display: Display, raster: ScreenRaster, patterns: Sequence[Pattern], clock: DriverClock, name: str
+    ) -> None:
+        self.settle_s = SETTLE_S
+        self.response = linear_response()
+        self._display, self._raster, self._patterns = display, raster, patterns
+        self._clock, self._name = clock, name
+        self._opened = False
+        self._prepared: dict[Pattern, Any] = {}
+        self._shown_s = 0.0
+
+    def open(self) -> DeviceIdentity:
+        """Take the display and prepare the patterns. Raises LinkError."""
+        self.close()
+        identity: DeviceIdentity = self._call("open", returns=DeviceIdentity)
+        self._opened = True
+        self.linearise(self.response)
+        return identity
+
+    def linearise(self, response: DisplayResponse) -> None:
+        """Prepare all patterns for a display with this response. Raises LinkError."""
+        self.response = response
+        self._prepared = {
+            pattern: self._call("prepare", response.levels_of(pattern_light(pattern, self._raster)))
+            for pattern in self._patterns
+        }
+
+    def show(self, pattern: Pattern) -> None:
+        """Show the pattern; returns when it is lit and settled. Raises LinkError."""
+        self.begin(pattern)
+        self.wait()
+
+    def begin(self, pattern: Pattern) -> None:
+        """Send the pattern to the display; it is lit after `wait`. Raises LinkError."""
+        if not self._opened:
+            self.open()
+        if pattern not in self._prepared:
+            raise LinkError(f"{self._name}: pattern {pattern.name!r} was not prepared")
+        self._send(self._prepared[pattern])
+
+    def wait(self) -> None:
+        """Return when the pattern is displayed and settled."""
+        self._clock.sleep(max(0.0, self._shown_s + self.settle_s - self._clock.now()))
+
+    def show_levels(self, levels: Levels) -> None:
+        """Send an image (height, width), level for level, for tests of the display; not waited for."""
+        shape = self._raster.height_px, self._raster.width_px
+        if levels.shape != shape:
+            raise ValueError(f"image is {levels.shape}, the screen {shape}")
+        if not self._opened:
+            self.open()
+        self._send(self._call("prepare", levels))
+
+    def close(self) -> None:
+        """Release the display. Never raises."""
+        self._prepared = {}
+        self._opened = False
+        close_driver(self._display)
+
+    def describe(self) -> dict[str, str]:
+        """For people: what the display says, and the settle time."""
+        found: dict[str, str] = call_driver(self._name, self._display, "describe", returns=dict)
+        return {"port": self._name, **found, "settle": f"{1000 * self.settle_s:.0f} ms"}
+
+    def _send(self, picture: Any) -> None:
+        self._call("show", picture)
+        self._shown_s = self._clock.now()
+
+    def _call(self, method: str, *arguments: Any, returns: type[Any] = object) -> Any:
+        try:
+            return call_driver(self._name, self._display, method, *arguments, returns=returns)
+        except LinkError:
+            self.close()
+            raise

@@ -1,0 +1,127 @@
+"""`devices new`: a driver for a device of one's own, its emulator and its tests, as a package to install."""
+
+import importlib.util
+import keyword
+import re
+import string
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from firmware_iface import roles
+from membrane_ctrl.config import toml_file
+from membrane_ctrl.config.schema import ROLES, DevicesConfig
+from membrane_ctrl.model import errors
+
+_TEMPLATES = Path(__file__).parent / "scaffold"
+_NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+_LONGEST = 30  # the lines of the files stay within 118 characters
+# What a role's instrument is, how the invented one answers, and two values in the role's unit
+_WORDS: dict[str, dict[str, Any]] = {
+    "displacement": {"what": "displacement sensor", "Role": "DisplacementSensor", "unit": "mm", "divisor": 1000.0},
+    "gauge_pressure": {"what": "pressure gauge", "Role": "PressureSensor", "unit": "mbar", "divisor": 100.0},
+    "barometer": {"what": "barometer", "Role": "Barometer", "unit": "hPa", "divisor": 100.0},
+    "thermometer": {"what": "thermometer", "Role": "Thermometer", "unit": "degC", "divisor": 1.0},
+    "pump": {"what": "pump", "Role": "Pump", "unit": "percent", "divisor": 100.0},
+    "vent": {"what": "valve", "Role": "Vent", "unit": "percent", "divisor": 100.0},
+}
+_SCALES = {"mm": "UM_PER_MM", "mbar": "PA_PER_MBAR", "hPa": "PA_PER_HPA", "degC": "DEGC", "percent": "PERCENT"}
+_EXAMPLES = {"displacement": (12.0, 20.0), "gauge_pressure": (600.0, 520.0), "barometer": (101_325.0, 99_800.0)}
+_OTHERS = {
+    "displacement": 'driver = "optoncdt1420"\nport = "/dev/ttyUSB0"\nrange_mm = 50\nrate_khz = 2\n',
+    "pump": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id = 3\n',
+    "gauge_pressure": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id = 5\n',
+}
+
+
+def write_package(name: str, role: str, folder: Path) -> int:
+    """Write the folder `<name>-driver` below another one, never over an existing one, and print what to do next.
+
+    Raises InputError for a name that is taken or is none, an unknown role, and a folder that cannot be written.
+    """
+    _require_free(name)
+    if role not in ROLES:
+        raise errors.InputError(f"--role {role}: no such role; {toml_file.hint(role, list(ROLES))}")
+    words = _substitutes(name, role)
+    target = folder / f"{words['dashed']}-driver"  # with a dash, Python never takes the folder for the module
+    kind = "actuator" if role in ("pump", "vent") else "displacement" if role == "displacement" else "value"
+    files = {
+        "pyproject.toml": "pyproject.toml.txt",
+        f"{name}.py": "driver.txt",
+        f"{name}_emulator.py": "emulator.txt",
+        f"test_{name}.py": "test.txt",
+        "lab.toml": "lab.toml.txt",
+    }
+    with errors.writing(target):
+        if target.exists() or target.is_symlink():
+            raise errors.InputError(f"{target}: exists already, and is not overwritten; choose another name")
+        target.mkdir(parents=True)
+        for file, template in files.items():
+            text = _of_kind((_TEMPLATES / template).read_text(encoding="utf-8"), kind)
+            (target / file).write_text(string.Template(text).substitute(words), encoding="utf-8")
+    typer.echo(
+        f"{target}: a driver, its emulator, its tests and lab.toml are written. Next (docs/new-device.md):\n"
+        f"  pip install --no-deps --editable {target}\n"
+        f"  python -m pytest {target}\n"
+        f"  membrane-ctrl hold --twin --devices {target / 'lab.toml'} --duration 1m",
+        err=True,
+    )
+    return errors.Exit.DONE
+
+
+def _require_free(name: str) -> None:
+    if not _NAME.fullmatch(name) or len(name) > _LONGEST:
+        rule = f"use at most {_LONGEST} small letters, digits and _, such as acme_gauge"
+        raise errors.InputError(f"{name}: not a name for a driver; {rule}")
+    built_in = {tag for section in toml_file.sections(DevicesConfig) for tag in _drivers(section)}
+    if name in built_in or keyword.iskeyword(name) or importlib.util.find_spec(name) is not None:
+        raise errors.InputError(f"{name}: taken by a driver or a Python module; choose another name")
+
+
+def _drivers(section: type[Any]) -> set[str]:
+    """Return the names of all drivers in a table and the tables below it."""
+    inner = [each for field in section.model_fields.values() for each in toml_file.sections(field.annotation)]
+    return {str(tag) for tag in toml_file.tags(section)}.union(*(_drivers(each) for each in inner))
+
+
+def _substitutes(name: str, role: str) -> dict[str, Any]:
+    words = _WORDS[role]
+    first, second = _EXAMPLES.get(role, (21.5, 23.0))
+    unit, divisor = words["unit"], words["divisor"]
+    others = {other: table for other, table in _OTHERS.items() if other != role}
+    return {
+        **words,
+        "name": name,
+        "dashed": name.replace("_", "-"),
+        "title": name.replace("_", " ").title(),
+        "Class": "".join(word.capitalize() for word in name.split("_")),
+        "MODEL": name.replace("_", "").upper(),
+        "role": role,
+        "read": roles.READS[role][0],
+        "role_unit": roles.READS[role][1],
+        "suffix": {"degC": "c"}.get(unit, unit.lower()),
+        "quantity": {"thermometer": "an error"}.get(role, "pressure"),
+        "field": unit,
+        "SCALE": _SCALES[unit],
+        "scale": 1 / divisor if unit == "percent" else divisor,
+        "example": first,
+        "second": second,
+        "barometer": str(role == "barometer").lower(),
+        "thermometer": str(role == "thermometer").lower(),
+        "others": "".join(f"[devices.{other}]\n{table}\n" for other, table in others.items()),
+    }
+
+
+def _of_kind(template: str, kind: str) -> str:
+    """Return a template's lines for a kind of instrument: those between `%kind ...` and `%end` are only for these."""
+    kept: list[str] = []
+    wanted = [True]
+    for line in template.splitlines():
+        if line == "%end":
+            wanted.pop()
+        elif line.startswith("%"):
+            wanted.append(kind in line[1:].split())
+        elif all(wanted):
+            kept.append(line)
+    return "\n".join([*kept, ""])

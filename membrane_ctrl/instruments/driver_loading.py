@@ -1,0 +1,72 @@
+"""Makes drivers and emulators of devices from their tables in the configuration; loads packages that these name.
+
+Only what opens or emulates devices imports this: reading a configuration loads no driver (decision 37).
+"""
+
+from typing import Any
+
+from firmware_iface import drivers, settings
+from membrane_ctrl.config import toml_file
+from membrane_ctrl.model.errors import InputError
+
+
+def name_of(section: Any) -> str:
+    """Return the name of a table's driver."""
+    return str(section.name if isinstance(section, settings.ExternalSection) else section.driver)
+
+
+def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settings.Section:
+    """Return the settings that a driver gets; a package's own class checks the table of its driver.
+
+    Raises InputError (no such driver, one without settings, or a key that its class refuses).
+    """
+    if not isinstance(section, settings.ExternalSection):
+        checked: settings.Section = section  # when the configuration was read
+        return checked
+    expected = getattr(_load_driver(section, where, kind), "Settings", None)
+    if not (isinstance(expected, type) and issubclass(expected, settings.Section)):
+        raise InputError(f"{where}: the {kind.name} {section.name} has no class Settings (docs/new-device.md)")
+    return toml_file.parse(section.keys, expected, where)
+
+
+def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
+    """Make the driver of a table, not yet connected.
+
+    Raises InputError for a driver that is not installed, does not load or cannot be made, and for a key that it
+    refuses.
+
+    Parameters
+    ----------
+    section : Section
+        The table.
+    where : str
+        Its place in the configuration, for messages.
+    kind : DriverKind
+    *more : object
+        What a driver of this kind gets after its settings.
+    """
+    make = _load_driver(section, where, kind)
+    return _construct(make, check_settings(section, where, kind), where, more)
+
+
+def make_emulator(section: settings.ExternalSection, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
+    """Make the emulator of a table's device. Raises InputError as `make_driver`."""
+    try:
+        make = drivers.load_emulator(section.name, kind)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error
+    return _construct(make, check_settings(section, where, kind), where, more)
+
+
+def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
+    try:
+        return drivers.load_driver(name_of(section), kind)
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _construct(make: Any, checked: settings.Section, where: str, more: tuple[Any, ...]) -> Any:
+    try:
+        return make(checked, *more)
+    except (Exception, SystemExit) as error:  # whatever its code does
+        raise InputError(f"{where}: {make.__name__} cannot be made: {type(error).__name__}: {error}") from error
