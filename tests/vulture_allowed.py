@@ -11,6 +11,7 @@ acquisition_main, alarms_main, console_main, recorder_main  # named as text to t
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
 Camera  # the role that the camera drivers fill
+AravisCamera, FolderCamera, PygameDisplay, UvcCamera  # named as text in firmware_iface/drivers/__init__.py
 _.common_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
 _.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with
