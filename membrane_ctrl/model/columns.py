@@ -83,26 +83,23 @@ class Plot:
         Without the unit, which is that of its columns.
     group : Group
         Of the columns that the plot shows.
-    means : bool
-        Whether the viewer also shows the mean of each second over the whole run.
     """
 
     title: str
     group: Group
-    means: bool = False
 
 
-POSITION = Plot("Position of the centre", Group.LOOP, means=True)
+POSITION = Plot("Position of the centre", Group.LOOP)
 ERROR = Plot("Error", Group.LOOP)
 TERMS = Plot("P, I, D and feed-forward", Group.LOOP)
-FLOW = Plot("Flow and leak", Group.PUMP, means=True)
-DRIVE = Plot("Pump and vent", Group.PUMP, means=True)
+FLOW = Plot("Flow and leak", Group.PUMP)
+DRIVE = Plot("Pump and vent", Group.PUMP)
 ESTIMATE_SIGMA = Plot("Estimate of the centre, 1 σ", Group.ESTIMATE)
 INNOVATIONS = Plot("Innovations in standard deviations", Group.ESTIMATE)
 OPTICS_SHARE = Plot("Share of the optics in the estimate", Group.ESTIMATE)
-GAUGE = Plot("Gauge pressure", Group.ENVIRONMENT, means=True)
-AMBIENT = Plot("Ambient pressure", Group.ENVIRONMENT, means=True)
-TEMPERATURES = Plot("Temperatures", Group.ENVIRONMENT, means=True)
+GAUGE = Plot("Gauge pressure", Group.ENVIRONMENT)
+AMBIENT = Plot("Ambient pressure", Group.ENVIRONMENT)
+TEMPERATURES = Plot("Temperatures", Group.ENVIRONMENT)
 TRIM = Plot("Trim of the shape loop", Group.SHAPE)
 LATENESS = Plot("Lateness of the tick", Group.TIMING)
 INTERVAL = Plot("Time between ticks", Group.TIMING)
@@ -167,6 +164,11 @@ class TelemetryColumn:
     def legend(self) -> str:
         """Label and unit as the viewer's legend has room for: `error µm`."""
         return f"{self.label} {self.unit}".rstrip()
+
+    @property
+    def twin_only(self) -> bool:
+        """Whether it is known of a simulated mirror only."""
+        return self.entity.startswith("/truth/")
 
     def format_value(self, value: float | None) -> str:
         """Return a value with its decimals; a dash for a missing one."""
@@ -436,10 +438,11 @@ COLUMNS: dict[str, TelemetryColumn] = {
     each.name: TelemetryColumn(each.name, **each.metadata[_TABLE_KEY]) for each in fields(ColumnValues)
 }
 
-# For people, group by group.
-PUBLISHED: tuple[TelemetryColumn, ...] = tuple(
-    each for group in Group for each in COLUMNS.values() if each.published and each.plot.group is group
+# Group by group: the order for people.
+BY_GROUP: tuple[TelemetryColumn, ...] = tuple(
+    each for group in Group for each in COLUMNS.values() if each.plot.group is group
 )
+PUBLISHED: tuple[TelemetryColumn, ...] = tuple(each for each in BY_GROUP if each.published)
 
 # Computed where it is shown (`telemetry.true_error_um`).
 TRUE_ERROR_COLUMN = TelemetryColumn(
@@ -452,3 +455,40 @@ TRUE_ERROR_COLUMN = TelemetryColumn(
     width=2.0,
     aggregation=_EXTREMES,
 )
+
+
+# By name: all columns, also those that no row has.
+EVERY_COLUMN: dict[str, TelemetryColumn] = {**COLUMNS, TRUE_ERROR_COLUMN.name: TRUE_ERROR_COLUMN}
+
+# What overview levels keep as minimum, mean and maximum.
+AGGREGATED: tuple[TelemetryColumn, ...] = tuple(
+    each for each in EVERY_COLUMN.values() if each.aggregation is Aggregation.EXTREMES
+)
+
+
+def plots_of(*groups: Group) -> tuple[Plot, ...]:
+    """Return the plots of some groups, group by group."""
+    return tuple(dict.fromkeys(each.plot for each in BY_GROUP if each.plot.group in groups))
+
+
+def columns_of(plot: Plot) -> tuple[TelemetryColumn, ...]:
+    """Return the columns that a plot shows, in the order of the table."""
+    return tuple(each for each in EVERY_COLUMN.values() if each.plot == plot)
+
+
+def plot_title(plot: Plot, detail: str = "") -> str:
+    """Return the title of a plot with its unit.
+
+    Parameters
+    ----------
+    plot : Plot
+    detail : str
+        What is shown of it, such as `mean of each second`.
+
+    Returns
+    -------
+    str
+        Such as `Flow and leak, mean of each second, µm/s`.
+    """
+    unit = columns_of(plot)[0].unit
+    return ", ".join(part for part in (plot.title, detail, unit) if part)

@@ -11,6 +11,8 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import columns
+from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.model.events import for_people
 from membrane_ctrl.model.telemetry import RunStatus, gains_words
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS
@@ -55,9 +57,19 @@ def _plot(name: str, *paths: str, span: tuple[float, float] | None = None, marks
     )
 
 
+def _ticks(plot: Plot, detail: str = "") -> rrb.TimeSeriesView:
+    """Plot columns as they are recorded: every tick around events, else one a second."""
+    return _plot(plot_title(plot, detail), *streams.entities_of(plot))
+
+
+def _means(plot: Plot) -> rrb.TimeSeriesView:
+    """Plot the mean of each second."""
+    return _plot(plot_title(plot, "mean of each second"), *map(streams.mean_path, streams.entities_of(plot)))
+
+
 def _error(config: Config) -> rrb.TimeSeriesView:
     return _around_band(
-        config, "Error of each second: least, mean, greatest, µm", "/overview/error", "/overview/truth/error"
+        config, "Error of each second: least, mean, greatest, µm", streams.OVERVIEW.path, streams.TRUE_MEAN.path
     )
 
 
@@ -91,14 +103,10 @@ def _text_log() -> rrb.TextLogView:
 
 
 def _overview(config: Config) -> rrb.Vertical:
-    position = ("/overview/loop/position", "/overview/truth/displacement")
     plots = rrb.Vertical(
         _error(config),
-        _plot("Setpoint, reading and true centre, mean of each second, µm", *position),
-        rrb.Horizontal(
-            _plot("Pump and vent, mean of each second", "/overview/pump/drive"),
-            _plot("Flow and leak, mean of each second, µm/s", "/overview/loop/flow"),
-        ),
+        _means(columns.POSITION),
+        rrb.Horizontal(_means(columns.DRIVE), _means(columns.FLOW)),
         _lanes(),
         row_shares=[3, 1.6, 1.6, 2.6],
     )
@@ -117,34 +125,28 @@ def learned(config: Config) -> dict[str, tuple[str, ...]]:
     if config.pump.probe_um:
         found["Pump against its curve"] = (streams.PUMP.path,)
     if config.estimator.process_value != "laser":
-        found["Estimate of the centre, 1 sigma, µm"] = ("/estimate/sigma",)
-        found["Innovations in standard deviations"] = ("/estimate/innovations", "/estimate/optics_share")
+        found |= {plot_title(plot): streams.entities_of(plot) for plot in plots_of(Group.ESTIMATE)}
     return found
+
+
+LOOP_PLOTS = tuple(plot for plot in plots_of(Group.LOOP, Group.PUMP) if plot != columns.ERROR)
 
 
 def _loop(config: Config) -> rrb.Vertical:
     further = [_plot(name, *paths) for name, paths in learned(config).items()]
+    plots = [*map(_ticks, LOOP_PLOTS), *further]
     return rrb.Vertical(
-        _around_band(config, f"Error and band, {_TICKS}, µm", "/loop/error", "/truth/error"),
-        _plot("Setpoint, reading and true centre, µm", "/loop/position", "/truth/displacement"),
-        _plot("P, I, D and feed-forward, µm/s", "/loop/terms"),
-        _plot("Flow wanted, flow and leak, µm/s", "/loop/flow"),
-        _plot("Pump and vent", "/pump/drive"),
-        *further,
-        row_shares=[3, 2, 2, 2, 2, *(2 for _ in further)],
+        _around_band(
+            config, plot_title(columns.ERROR, f"with the band, {_TICKS}"), *streams.entities_of(columns.ERROR)
+        ),
+        *plots,
+        row_shares=[3, *(2 for _ in plots)],
         name="Loop",
     )
 
 
 def _environment(config: Config) -> rrb.Vertical:
-    temperatures = ("/overview/ambient/temperature", "/overview/gas/temperature")
-    return rrb.Vertical(
-        _plot("Ambient pressure, mean of each second, Pa", "/overview/ambient/pressure"),
-        _plot("Gauge pressure, mean of each second, Pa", "/overview/gas/pressure"),
-        _plot("Temperatures, mean of each second, °C", *temperatures),
-        _error(config),
-        name="Environment",
-    )
+    return rrb.Vertical(*map(_means, plots_of(Group.ENVIRONMENT)), _error(config), name="Environment")
 
 
 def _map(kind: str, name: str) -> rrb.Spatial2DView:
@@ -168,7 +170,7 @@ def _shape(config: Config) -> rrb.Vertical:
     rows = [
         maps,
         rrb.Horizontal(
-            _plot("Sag change by camera and laser, trim, µm", "/shape/sag_change", "/shape/trim",
+            _plot("Sag change by camera and laser, trim, µm", "/shape/sag_change", *streams.entities_of(columns.TRIM),
                   span=(-band_um, band_um), marks=True),
             _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
             rrb.BarChartView(
@@ -181,6 +183,7 @@ def _shape(config: Config) -> rrb.Vertical:
             _plot("Slope residual, µrad", "/shape/residual"),
             _plot("Fringe quality", "/shape/quality"),
             _plot("Last frame to result, ms", "/shape/latency"),
+            *(_ticks(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
         ),
     ]  # fmt: skip
     if config.shape.mode == "track":
@@ -196,13 +199,8 @@ def _shape(config: Config) -> rrb.Vertical:
 
 
 def _timing() -> rrb.Vertical:
-    return rrb.Vertical(
-        _plot(f"Lateness of the tick, {_TICKS}, ms", "/tick/lateness"),
-        _plot("Time between ticks, s", "/tick/dt"),
-        _plot("Ticks missed so far", "/tick/missed"),
-        _plot("Last frame to result, ms", "/shape/latency"),
-        name="Timing",
-    )
+    ticks = [_ticks(plot, _TICKS) for plot in plots_of(Group.TIMING)]
+    return rrb.Vertical(*ticks, _plot("Last frame to result, ms", "/shape/latency"), name="Timing")
 
 
 # State lanes: the words of a lane, their colours, and the meaning of a row's codes.

@@ -10,6 +10,7 @@ import rerun as rr
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
+from membrane_ctrl.model.columns import COLUMNS, Kind
 from membrane_ctrl.model.events import EventLine, for_people, level, sentence
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
@@ -48,7 +49,7 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
 
 
 # Every tick is recorded around a change of these, and while the error is outside the band.
-_CODES = ("state", "shape_state", "safe_level", "fault")
+_CODES = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
 _AFTER_S = 60.0
 _BEFORE_S = 10.0
 

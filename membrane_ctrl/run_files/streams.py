@@ -18,7 +18,18 @@ from membrane_ctrl.controller import safety
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column, FloatArray
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
-from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, TelemetryColumn
+from membrane_ctrl.model.columns import (
+    BY_GROUP,
+    COLUMNS,
+    POSITION,
+    TRUE_ERROR_COLUMN,
+    Group,
+    Kind,
+    Plot,
+    TelemetryColumn,
+    columns_of,
+    plots_of,
+)
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import Rows, column
 from membrane_ctrl.model.zernike_terms import zernike_labels
@@ -52,7 +63,7 @@ def _line(each: TelemetryColumn) -> Line:
 
 def _telemetry_streams() -> tuple[Stream, ...]:
     by_entity: dict[str, list[Line]] = {}
-    for each in COLUMNS.values():
+    for each in BY_GROUP:
         if each.entity:
             by_entity.setdefault(each.entity, []).append(_line(each))
     return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
@@ -61,10 +72,21 @@ def _telemetry_streams() -> tuple[Stream, ...]:
 # Every column except `mono_s`, the time axis, is in exactly one stream.
 STREAMS: tuple[Stream, ...] = _telemetry_streams()
 
+
+def entities_of(plot: Plot) -> tuple[str, ...]:
+    """Return the Rerun entities that a plot shows."""
+    return tuple(dict.fromkeys(each.entity for each in columns_of(plot)))
+
+
+def mean_path(entity: str) -> str:
+    """Return the entity of the means of each second of an entity."""
+    return f"/overview{entity}"
+
+
 # Computed here from the rows, so that plots need no arithmetic.
 TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_line(TRUE_ERROR_COLUMN),))
 OVERVIEW = Stream(
-    "/overview/error",
+    mean_path("/loop/error"),
     (
         Line("", "error, least of a second µm", GREY, 1.0),
         Line("", "error, mean of a second µm", BLUE, 2.0),
@@ -73,9 +95,10 @@ OVERVIEW = Stream(
 )
 # A point per second all over the run: the others have every tick around events and one per second in quiet times, and
 # a line that changes its density looks as if the mirror had changed.
-_MEANS = frozenset(each.entity for each in COLUMNS.values() if each.plot.means)
-MEANS = tuple(replace(stream, path=f"/overview{stream.path}") for stream in STREAMS if stream.path in _MEANS)
-TRUE_MEAN = replace(TRUE_ERROR, path="/overview/truth/error")
+_MEAN_PLOTS = (POSITION, *plots_of(Group.PUMP, Group.ENVIRONMENT))
+_MEANS = frozenset(each.entity for plot in _MEAN_PLOTS for each in columns_of(plot))
+MEANS = tuple(replace(stream, path=mean_path(stream.path)) for stream in STREAMS if stream.path in _MEANS)
+TRUE_MEAN = replace(TRUE_ERROR, path=mean_path(TRUE_ERROR.path))
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
 
 
@@ -164,7 +187,7 @@ def mean_row(rows: Rows) -> Rows:
 
 
 TIMES = ("mono_s", "time_s", "time_utc")
-_COUNTS = ("tick", "missed_ticks", "sample_counter", "rows")
+_COUNTS = ("rows", *(each.name for each in COLUMNS.values() if each.kind is Kind.COUNT))
 _TIME_MAX_S = 1e9  # thirty years: a damaged file may hold any time
 
 

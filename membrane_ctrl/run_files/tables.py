@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.controller.tick import RECORD, SAME, TickBatch
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.columns import AGGREGATED, COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Kind
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import column_codec
 from membrane_ctrl.run_files.column_file import ColumnFile
@@ -20,28 +21,14 @@ from membrane_ctrl.run_files.column_file import ColumnFile
 # Overview levels: minimum, mean and maximum of each signal per 1, 10 and 60 s, so that a month opens in seconds.
 #
 # A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows` (ticks in it), the
-# codes of `CODES` at its end (`fault`: the largest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
+# codes at its end (of some the largest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
 Columns = dict[str, Column]
 
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
-# Signals that people view or search over hours; `true_error_um` is computed here, and NaN on a real bench.
-SIGNALS: tuple[str, ...] = (
-    "error_um",
-    "true_error_um",
-    "displacement_um",
-    "displacement_quality",
-    "flow_um_per_s",
-    "feedforward_um_per_s",
-    "leak_um_per_s",
-    "pump_fraction",
-    "trim_um",
-    "gauge_pressure_pa",
-    "ambient_pressure_pa",
-    "air_temperature_c",
-    "lateness_ms",
-    "missed_ticks",
-)
-CODES: tuple[str, ...] = ("state", "shape_state", "safe_level", "fault")
+# Minimum, mean and maximum of these, and the codes, as the table of columns says.
+SIGNALS: tuple[str, ...] = tuple(each.name for each in AGGREGATED)
+CODES: tuple[str, ...] = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
+_LARGEST = tuple(name for name in CODES if COLUMNS[name].aggregation is Aggregation.LARGEST)
 NAMES: tuple[str, ...] = (
     "time_s",
     "rows",
@@ -49,12 +36,9 @@ NAMES: tuple[str, ...] = (
     *(f"{kind}_{name}" for name in SIGNALS for kind in ("min", "mean", "max")),
 )
 # The telemetry fields from which levels are computed.
-TICK_FIELDS: tuple[str, ...] = (
-    "mono_s",
-    *CODES,
-    *(name for name in SIGNALS if name != "true_error_um"),
-    "target_um",
-    "truth_displacement_um",
+_OF_TRUE_ERROR = ("target_um", "truth_displacement_um")
+TICK_FIELDS: tuple[str, ...] = tuple(
+    dict.fromkeys(("mono_s", *CODES, *(name for name in SIGNALS if name in COLUMNS), *_OF_TRUE_ERROR))
 )
 
 
@@ -67,7 +51,7 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     level: Columns = {"time_s": window, "rows": _counts(starts, time_s.size)}
     level |= _codes(ticks, starts)
     for name in SIGNALS:
-        values = telemetry.true_error_um(ticks) if name == "true_error_um" else ticks[name]
+        values = telemetry.true_error_um(ticks) if name == TRUE_ERROR_COLUMN.name else ticks[name]
         level[f"min_{name}"] = np.fmin.reduceat(values, starts)
         level[f"mean_{name}"] = _mean(values, np.ones(values.size), starts)
         level[f"max_{name}"] = np.fmax.reduceat(values, starts)
@@ -108,7 +92,7 @@ def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
     size = next(iter(table.values())).size
     last = np.append(starts[1:], size) - 1
     codes = {name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table}
-    return codes | ({"fault": np.fmax.reduceat(table["fault"], starts)} if "fault" in table else {})
+    return codes | {name: np.fmax.reduceat(table[name], starts) for name in _LARGEST if name in table}
 
 
 def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:

@@ -45,7 +45,8 @@ for _ in range(600):
     time.sleep(0.05)
 names = [name for name in table.schema.names if name.startswith("property:run:")]
 rows = table.select(["rerun_segment_id", *names]).to_pylist()
-drawn = runs.filter_segments("20261122T180000Z-night").filter_contents(["/overview/error"]).reader(index="run_time")
+night = runs.filter_segments("20261122T180000Z-night")
+drawn = night.filter_contents(["/overview/loop/error"]).reader(index="run_time")
 print(json.dumps({"rows": rows, "seconds": drawn.to_arrow_table().num_rows}))
 """
 

@@ -137,7 +137,7 @@ def test_maps_are_those_of_the_cycles_in_stated_colours(night: Path, tmp_path: P
 def test_overlaid_runs_have_their_names(night: Path, tmp_path: Path) -> None:
     layer = reviewed([night, written(tmp_path, 0.02, name="20261122T180000Z-b c")], tmp_path / "r.rrd")
     for path, name in (("/night", "night"), (r"/b\ c", "b c")):
-        (lines,) = layer[f"{path}/overview/true"]["SeriesLines:names"]
+        (lines,) = layer[f"{path}/overview/truth/error"]["SeriesLines:names"]
         assert lines == [f"{name}: true error, mean µm"]
         assert f"{path}/summary" in layer
 

@@ -283,7 +283,7 @@ def test_the_viewer_is_given_levels_ticks_figure_and_what_was_found(tmp_path: Pa
     make_review([run], ReviewOptions([run.folder]), tmp_path / "r.rrd")
     rows = entities(tmp_path / "r.rrd")
     assert rows["/loop/error"] >= 7200
-    assert rows["/overview/error"] >= 720
+    assert rows["/overview/loop/error"] >= 720
     assert rows["/shape/map/difference"] >= 20
     assert rows["/found"] >= 1
 
@@ -337,7 +337,7 @@ def test_nothing_to_show_is_explained_and_beside_another_run_only_noted(
     assert said.splitlines()[-1].endswith("no readable telemetry")
     assert command(["review", str(broken), str(whole), "--save", str(target)]) == 0
     assert "broken: not shown" in capsys.readouterr().err
-    assert entities(target)["/overview/error"] > 0
+    assert entities(target)["/overview/loop/error"] > 0
 
 
 def listens(port: int) -> bool:

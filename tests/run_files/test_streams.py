@@ -83,7 +83,7 @@ def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> 
     telemetry.finish()
     recording.close()
     seconds = rows.reshape(20, 50, -1)
-    for path, field in (("/overview/error", "error_um"), ("/overview/loop/flow", "flow_um_per_s")):
+    for path, field in (("/overview/loop/error", "error_um"), ("/overview/loop/flow", "flow_um_per_s")):
         time_s, values = scalars(tmp_path / "test-000.rrd", path)
         assert time_s == pytest.approx(np.arange(20) + 0.49), path
         assert values[:, 1] == pytest.approx(seconds[:, :, COLUMN[field]].mean(axis=1)), path

@@ -10,14 +10,17 @@ from rerun.blueprint.components import AbsoluteTimeRange
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import columns
+from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.recorder import blueprint
-from membrane_ctrl.review.viewer.layer import prefix_of
+from membrane_ctrl.review.viewer.layer import overview_streams, prefix_of
+from membrane_ctrl.run_files import streams
 
-TABS = ("overview", "loop", "shape", "faults", "tuning")
+TABS = ("overview", "loop", "environment", "shape", "faults", "tuning")
 
 
 # Of the coarse review of a run in the catalogue, which has no ticks.
-COARSE_TABS = ("overview", "shape", "faults")
+COARSE_TABS = ("overview", "environment", "shape", "faults")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +47,8 @@ class ReviewBlueprint:
     def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
         """The blueprint, with some of `TABS`, `tab` selected."""
         makers = {
-            "overview": self._overview, "loop": self._loop, "shape": self._shape, "faults": self._faults,
-            "tuning": self._tuning,
+            "overview": self._overview, "loop": self._loop, "environment": self._environment, "shape": self._shape,
+            "faults": self._faults, "tuning": self._tuning,
         }  # fmt: skip
         selection = None if self.span_ns is None else AbsoluteTimeRange(*self.span_ns)
         return rrb.Blueprint(
@@ -75,6 +78,12 @@ class ReviewBlueprint:
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),  # over the oldest data
         )
 
+    def _ticks(self, plot: Plot) -> rrb.TimeSeriesView:
+        return self._plot(plot_title(plot), *streams.entities_of(plot))
+
+    def _level(self, plot: Plot) -> rrb.TimeSeriesView:
+        return self._plot(plot_title(plot), *(stream.path for stream in overview_streams(plot)))
+
     def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
         """A plot of the error, with lines where something happened: these would stretch an axis of no fixed span."""
         band_um = self.config.limits.band_um
@@ -82,7 +91,9 @@ class ReviewBlueprint:
         return self._plot(name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um)
 
     def _error(self) -> rrb.TimeSeriesView:
-        return self._around_band("Error: minimum, mean, maximum, µm", "/overview/error", "/overview/true")
+        return self._around_band(
+            "Error: minimum, mean, maximum, µm", *(stream.path for stream in overview_streams(columns.ERROR))
+        )
 
     def _lanes(self) -> rrb.StateTimelineView:
         several = len(self.labels) > 1  # there is room for two lanes of each
@@ -117,11 +128,7 @@ class ReviewBlueprint:
         plots = rrb.Vertical(
             self._error(),
             self._lanes(),
-            rrb.Horizontal(
-                self._plot("Flow and leak, µm/s", "/overview/flow"),
-                self._plot("Air pressure, Pa", "/overview/ambient"),
-                self._plot("Air temperature, °C", "/overview/temperature"),
-            ),
+            rrb.Horizontal(*map(self._level, (columns.FLOW, columns.AMBIENT, columns.TEMPERATURES))),
             row_shares=[3.6, 2.5, 2],
         )
         return rrb.Vertical(
@@ -133,16 +140,20 @@ class ReviewBlueprint:
 
     def _loop(self) -> rrb.Vertical:
         further = [self._plot(name, *paths) for name, paths in blueprint.learned(self.config).items()]
+        plots = [*map(self._ticks, blueprint.LOOP_PLOTS), *further]
         return rrb.Vertical(
-            self._around_band("Error, each tick, µm (shown for short runs, or with --from and --to)", "/loop/error"),
-            self._plot("Setpoint, reading, true centre, µm", "/loop/position", "/truth/displacement"),
-            self._plot("P, I, D, feed-forward, µm/s", "/loop/terms"),
-            self._plot("Flow and leak, µm/s", "/loop/flow"),
-            self._plot("Pump and vent", "/pump/drive"),
-            *further,
-            row_shares=[3, 2, 2, 2, 2, *(2 for _ in further)],
+            self._around_band(
+                f"{plot_title(columns.ERROR, 'each tick')} (shown for short runs, or with --from and --to)",
+                "/loop/error",
+            ),
+            *plots,
+            row_shares=[3, *(2 for _ in plots)],
             name="loop",
         )
+
+    def _environment(self) -> rrb.Vertical:
+        plots = [self._level(plot) for plot in plots_of(Group.PUMP, Group.ENVIRONMENT)]
+        return rrb.Vertical(self._error(), *plots, row_shares=[2, *(1 for _ in plots)], name="environment")
 
     def _shape(self) -> rrb.Vertical:
         rows = [self._maps(label) for label in self.labels]
@@ -152,7 +163,7 @@ class ReviewBlueprint:
                 self._plot("Low orders, change ± 1σ, µm", "/shape/change"),
             ),
             rrb.Horizontal(
-                self._plot("Slope residual, µrad", "/shape/residual"), self._plot("Trim, µm", "/overview/trim")
+                self._plot("Slope residual, µrad", "/shape/residual"), *map(self._level, plots_of(Group.SHAPE))
             ),
         ]
         return rrb.Vertical(*rows, *plots, row_shares=[3] * len(rows) + [2.5, 1.5], name="shape")
@@ -178,11 +189,7 @@ class ReviewBlueprint:
         return rrb.Vertical(
             self._lanes(),
             self._error(),
-            rrb.Horizontal(
-                self._plot("Lateness, ms", "/overview/lateness"),
-                self._plot("Ticks missed so far", "/overview/missed"),
-                self._plot("Gauge pressure, Pa", "/overview/gauge"),
-            ),
+            rrb.Horizontal(*map(self._level, (columns.LATENESS, columns.MISSED, columns.GAUGE))),
             rrb.Horizontal(self._log("Events, UTC", "/events"), self._log("Detected events, UTC", "/found")),
             row_shares=[2.2, 3, 2, 2.8],
             name="faults",
@@ -190,13 +197,10 @@ class ReviewBlueprint:
 
     def _tuning(self) -> rrb.Vertical:
         return rrb.Vertical(
-            self._plot("Reading, filtered, setpoint, µm", "/loop/position"),
-            self._around_band("True and measured error, µm", "/loop/error", "/truth/error"),
-            rrb.Horizontal(
-                self._plot("P, I, D, feed-forward, µm/s", "/loop/terms"),
-                self._plot("Flow wanted and given, µm/s", "/loop/flow"),
-            ),
-            self._plot("Time between ticks, s", "/tick/dt"),
+            self._ticks(columns.POSITION),
+            self._around_band(plot_title(columns.ERROR), *streams.entities_of(columns.ERROR)),
+            rrb.Horizontal(self._ticks(columns.TERMS), self._ticks(columns.FLOW)),
+            self._ticks(columns.INTERVAL),
             name="tuning",
         )
 

@@ -15,6 +15,7 @@ import rerun as rr
 from membrane_ctrl.model import events, telemetry
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
+from membrane_ctrl.model.columns import AGGREGATED, Group, Plot, columns_of, plots_of
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
 from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
@@ -35,27 +36,24 @@ MAPS_MOST = 40
 _RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 
 
-# Plots of a level: signals (column, name, colour) by path.
-OVERVIEWS: dict[str, tuple[tuple[str, str, Colour], ...]] = {
-    "/overview/error": (
-        ("min_error_um", "error, minimum µm", GREY),
-        ("mean_error_um", "error, mean µm", BLUE),
-        ("max_error_um", "error, maximum µm", GREY),
-    ),
-    "/overview/true": (("mean_true_error_um", "true error, mean µm", GREEN),),
-    "/overview/flow": (("mean_flow_um_per_s", "flow µm/s", BLUE), ("mean_leak_um_per_s", "leak µm/s", RED)),
-    "/overview/pump": (("mean_pump_fraction", "pump", BLUE),),
-    "/overview/trim": (("mean_trim_um", "trim µm", VIOLET),),
-    "/overview/ambient": (("mean_ambient_pressure_pa", "air pressure Pa", BLUE),),
-    "/overview/gauge": (("mean_gauge_pressure_pa", "gauge pressure Pa", BLUE),),
-    "/overview/temperature": (("mean_air_temperature_c", "air °C", ORANGE),),
-    "/overview/lateness": (
-        ("mean_lateness_ms", "lateness, mean ms", BLUE),
-        ("max_lateness_ms", "lateness, maximum ms", GREY),
-    ),
-    "/overview/missed": (("max_missed_ticks", "ticks missed so far", RED),),
-}
+def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
+    """Return the streams of a plot of an overview level; the field of a line is a column of the level.
 
+    Each column of the plot that levels keep gives a line of its means; a single one gives minimum and maximum, too.
+    """
+    kept = [each for each in columns_of(plot) if each in AGGREGATED]
+    alone = sum(not each.twin_only for each in kept) == 1
+    by_entity: dict[str, list[streams.Line]] = {}
+    for each in kept:
+        lines = by_entity.setdefault(streams.mean_path(each.entity), [])
+        for kind, name in _EXTREMES.items() if alone and not each.twin_only else ():
+            lines.append(streams.Line(f"{kind}_{each.name}", f"{each.label}, {name} {each.unit}", GREY, 1.0))
+        lines.append(streams.Line(f"mean_{each.name}", f"{each.label}, mean {each.unit}", each.colour, each.width))
+    return tuple(streams.Stream(path, tuple(lines)) for path, lines in by_entity.items())
+
+
+_EXTREMES = {"min": "minimum", "max": "maximum"}
+OVERVIEWS = tuple(stream for plot in plots_of(*Group) for stream in overview_streams(plot))
 
 _COLOUR_WORDS = (
     "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
@@ -126,11 +124,11 @@ class Layer:
         self._figure(cycles.select(summary.held_at(level, cycles.time_s)), part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
-        for path, lines in OVERVIEWS.items():
-            values = np.column_stack([level[name] for name, _, _ in lines])
+        for stream in OVERVIEWS:
+            values = np.column_stack([level[line.field] for line in stream.lines])
             if np.isfinite(values).any():
-                self._style(path, [(name, colour) for _, name, colour in lines])
-                self._scalars(path, level["time_s"], values)
+                self._style(stream.path, [(line.name, line.colour) for line in stream.lines])
+                self._scalars(stream.path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         band = streams.band(band_um)
         square = np.full((ends.size, 1), band_um**2)
