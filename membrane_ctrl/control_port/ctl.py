@@ -15,9 +15,13 @@ from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession
 from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
+from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
 from membrane_ctrl.model.lock import Lock, describe_lock
 
 _LOCK_FIELDS = tuple(field.name for field in fields(Lock))
+
+_LABEL_WIDTH = 18
+_WATCHED = ("mono_s", "error_um", "pump_fraction")
 
 _FLEET_S = 10.0  # for all holds of a fleet, which are asked at once
 
@@ -111,7 +115,9 @@ def fleet_line(status: dict[str, Any]) -> str:
     words = [f"LOCKED {line}" for line in lock_lines(status)]
     words += [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
     words += notices or [str(status.get("why") or "as it should be")]
-    return f"{status['state']:10}{_shown(row.get('error_um'))} um {'; '.join(words)}"
+    error = COLUMNS["error_um"]
+    shown = f"{error.format_value(row.get(error.name)):>10} {error.unit}"
+    return f"{status['state']:10}{shown} {'; '.join(words)}"
 
 
 def lock_lines(status: Mapping[str, Any]) -> list[str]:
@@ -146,25 +152,18 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
     lines += [f"OPEN {message}" for message in status.get("interlocks", {}).values()]
     if row:
-        shown = {
-            "setpoint": ("setpoint_um", "um"),
-            "reading": ("displacement_um", "um"),
-            "error": ("error_um", "um"),
-            "flow": ("flow_um_per_s", "um/s"),
-            "leak": ("leak_um_per_s", "um/s"),
-            "gauge pressure": ("gauge_pressure_pa", "Pa"),
-            "trim": ("trim_um", "um"),
-            "late": ("lateness_ms", "ms"),
-        }
-        lines += [f"  {name:15}{_shown(row.get(field))} {unit}" for name, (field, unit) in shown.items()]
+        lines += [
+            f"  {each.label:{_LABEL_WIDTH}}{each.format_value(row.get(each.name)):>10} {each.unit}".rstrip()
+            for each in PUBLISHED
+        ]
         if gains := status.get("gains"):
-            lines.append(f"  {'gains':15}{telemetry.gains_words(gains, status.get('trial_left_s'))}")
+            lines.append(f"  {'gains':{_LABEL_WIDTH}}{telemetry.gains_words(gains, status.get('trial_left_s'))}")
         shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
-        lines.append(f"  {'shape loop':15}{shape}".rstrip())
-        lines.append(f"  {'geometry':15}{_geometry(status.get('geometry'))}")
-    lines += [f"  {'maintenance':15}{message}" for message in status.get("maintenance", {}).values()]
-    lines += [f"  {'recording':15}{message}" for message in status.get("recording", {}).values()]
-    lines.append(f"  {'commander':15}{_commander(status)}")
+        lines.append(f"  {'shape loop':{_LABEL_WIDTH}}{shape}".rstrip())
+        lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_geometry(status.get('geometry'))}")
+    lines += [f"  {'maintenance':{_LABEL_WIDTH}}{message}" for message in status.get("maintenance", {}).values()]
+    lines += [f"  {'recording':{_LABEL_WIDTH}}{message}" for message in status.get("recording", {}).values()]
+    lines.append(f"  {'commander':{_LABEL_WIDTH}}{_commander(status)}")
     return lines
 
 
@@ -202,15 +201,14 @@ def _print_watched(status: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(status), flush=True)
         return
     row = status.get("row") or {}
-    print(
-        f"{_shown(row.get('mono_s'))} s  {status['state']:8} error {_shown(row.get('error_um'))} um  "
-        f"pump {_shown(row.get('pump_fraction'))}  {status['why']}",
-        flush=True,
-    )
+    shown = "  ".join(_quantity(row, name) for name in _WATCHED)
+    print(f"{status['state']:8} {shown}  {status['why']}", flush=True)
 
 
-def _shown(value: float | None) -> str:
-    return f"{value:10.3f}" if value is not None else f"{'-':>10}"
+def _quantity(row: Mapping[str, Any], name: str) -> str:
+    """A value of a row with its label and unit, in a width that stays the same from line to line."""
+    column = COLUMNS[name]
+    return f"{column.label} {column.format_value(row.get(name)):>9} {column.unit}".rstrip()
 
 
 def loop_keys(argument: str) -> dict[str, Any]:

@@ -52,7 +52,7 @@ def names() -> None:
 
     print("| name | unit | what |\n|---|---|---|")
     for each in TABLE:
-        print(f"| `{each.name}` | {each.unit or 'text'} | {each.says} |")
+        print(f"| `{each.name}` | {'text' if each.is_text else each.unit or '1'} | {each.description} |")
 
 
 async def _serve(door: Door) -> None:

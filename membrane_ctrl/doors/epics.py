@@ -14,7 +14,7 @@ from typing import Any
 
 from membrane_ctrl.config.port import EpicsConfig
 from membrane_ctrl.doors.epics_search import require_unserved
-from membrane_ctrl.doors.names import TABLE, Door, Value
+from membrane_ctrl.doors.names import TABLE, Door, Published, Value
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Action
@@ -61,7 +61,7 @@ def _opened(config: EpicsConfig, door: Door) -> dict[str, Any]:
     from softioc import asyncio_dispatcher, builder, imports, softioc  # they read the environment
 
     builder.SetDeviceName(door.settings.name)
-    records = {each.name: _record(builder, each.name, each.unit, each.says) for each in TABLE}
+    records = {each.name: _record(builder, each) for each in TABLE}
     for do, action in door.commands.items():
         _command(builder, door, do, action, records["answer"])
     builder.LoadDatabase()
@@ -90,11 +90,11 @@ def _fitting(value: Value) -> Value:
     return value
 
 
-def _record(builder: Any, name: str, unit: str, says: str) -> Any:
-    says = says.replace("`", "")[:40]  # EPICS has no more room
-    if not unit:
-        return builder.longStringIn(name, length=_TEXT_BYTES, DESC=says)
-    return builder.aIn(name, EGU=unit, PREC=_DIGITS, DESC=says)
+def _record(builder: Any, published: Published) -> Any:
+    description = published.description.replace("`", "")[:40]  # EPICS has no more room
+    if published.is_text:
+        return builder.longStringIn(published.name, length=_TEXT_BYTES, DESC=description)
+    return builder.aIn(published.name, EGU=published.unit, PREC=_DIGITS, DESC=description)
 
 
 def _command(builder: Any, door: Door, do: str, action: Action, answer: Any) -> None:

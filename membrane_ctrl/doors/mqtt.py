@@ -343,11 +343,11 @@ def discovery(door: Door, base: str) -> dict[str, Any]:
 
 def _sensor(each: Published, name: str) -> dict[str, Any]:
     found: dict[str, Any] = {"platform": "sensor", "unique_id": f"membrane_{name}_{each.name}", "name": each.name}
-    if not each.unit:
+    if each.is_text:
         found["value_template"] = f"{{{{ (value_json.{each.name} or '')[:{_STATE_LETTERS}] }}}}"
         return found
     found |= {"value_template": f"{{{{ value_json.{each.name} }}}}", "state_class": "measurement"}
-    if each.unit != "1":
+    if each.unit:
         found["unit_of_measurement"] = each.unit
     if each.unit in _CLASSES:
         found["device_class"] = _CLASSES[each.unit]

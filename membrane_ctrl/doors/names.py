@@ -15,6 +15,7 @@ from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.doors.command_lanes import CommandLanes
 from membrane_ctrl.doors.hold_link import SendLimits, send_command
+from membrane_ctrl.model.columns import PUBLISHED, unit_of
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
@@ -29,47 +30,36 @@ _SAFETY_SHOWN_S = 5.0  # the answer to a safety command stays for so long, whate
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A published value; without a unit it is a text."""
+    """A published value: a text, or a number with its unit (empty for counts and fractions)."""
 
     name: str
-    unit: str
-    says: str
+    description: str
+    is_text: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Unit for people, from the name."""
+        return unit_of(self.name)
 
 
-_TICK = (
-    Published("error_um", "um", "setpoint minus laser"),
-    Published("setpoint_um", "um", "setpoint of the loop, with the trim"),
-    Published("target_um", "um", "end of the setpoint's ramp"),
-    Published("displacement_um", "um", "laser reading, or the optics' on a bench held without a laser"),
-    Published("trim_um", "um", "shape loop's part of the setpoint"),
-    Published("flow_um_per_s", "um/s", "pump's flow, as motion of the centre"),
-    Published("leak_um_per_s", "um/s", "leak, as motion of the centre"),
-    Published("pump_fraction", "1", "pump command, share of full scale"),
-    Published("vent_fraction", "1", "vent command, share of full scale"),
-    Published("gauge_pressure_pa", "Pa", "pressure in the mirror above ambient"),
-    Published("ambient_pressure_pa", "Pa", "barometer"),
-    Published("air_temperature_c", "°C", "air around the mirror"),
-    Published("gas_temperature_c", "°C", "gas in the mirror"),
-    Published("lateness_ms", "ms", "how late the newest tick began"),
-    Published("missed_ticks", "1", "missed ticks of the run"),
-)
+_TICK = tuple(Published(each.name, each.description) for each in PUBLISHED)
 _TERMS = range(4, 12)  # Noll: defocus to the first spherical term
 _FIGURE = (
-    Published("sag_um", "um", "sag of the newest figure"),
-    Published("sag_sigma_um", "um", "its standard deviation from noise"),
-    Published("figure_age_s", "s", "age of that figure"),
-    *(Published(f"z{j}_um", "um", f"its Zernike term j = {j} (Noll, RMS)") for j in _TERMS),
+    Published("sag_um", "sag of the newest figure"),
+    Published("sag_sigma_um", "its standard deviation from noise"),
+    Published("figure_age_s", "age of that figure"),
+    *(Published(f"z{j}_um", f"its Zernike term j = {j} (Noll, RMS)") for j in _TERMS),
 )
 _TEXTS = (
-    Published("state", "", "state of the hold, or `no contact`"),
-    Published("why", "", "the one-line reason"),
-    Published("run", "", "name of the run"),
-    Published("fault", "", "the fault with its cause and remedy; empty without one"),
-    Published("locks", "", "the locks: text, author, time and word of each; empty without one"),
-    Published("interlocks", "", "the open interlocks with their texts; empty without one"),
-    Published("notices", "", "maintenance notices, and what fails in the recording"),
-    Published("figure_verdict", "", "verdict on the newest figure"),
-    Published("answer", "", "what became of the last command of any door"),
+    Published("state", "state of the hold, or `no contact`", is_text=True),
+    Published("why", "the one-line reason", is_text=True),
+    Published("run", "name of the run", is_text=True),
+    Published("fault", "the fault with its cause and remedy; empty without one", is_text=True),
+    Published("locks", "the locks: text, author, time and word of each; empty without one", is_text=True),
+    Published("interlocks", "the open interlocks with their texts; empty without one", is_text=True),
+    Published("notices", "maintenance notices, and what fails in the recording", is_text=True),
+    Published("figure_verdict", "verdict on the newest figure", is_text=True),
+    Published("answer", "what became of the last command of any door", is_text=True),
 )
 TABLE = (*_TEXTS, *_TICK, *_FIGURE)
 

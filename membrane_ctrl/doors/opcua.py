@@ -109,11 +109,13 @@ async def _nodes(server: Server, space: int, door: Door, users: dict[str, KnownU
     found = {}
     for each in TABLE:
         node = await mirror.add_variable(
-            ua.NodeId(f"{name}.{each.name}", space), ua.QualifiedName(each.name, space), 0.0 if each.unit else ""
+            ua.NodeId(f"{name}.{each.name}", space), ua.QualifiedName(each.name, space), "" if each.is_text else 0.0
         )
-        await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(each.says))))
+        await node.write_attribute(
+            ua.AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(each.description)))
+        )
         if each.unit:
-            unit = ua.EUInformation(_UNITS, -1, ua.LocalizedText(each.unit), ua.LocalizedText(each.says))
+            unit = ua.EUInformation(_UNITS, -1, ua.LocalizedText(each.unit), ua.LocalizedText(each.description))
             await node.add_property(ua.NodeId(f"{name}.{each.name}.unit", space), "0:EngineeringUnits", unit)
         found[each.name] = node
     for do, action in door.commands.items():

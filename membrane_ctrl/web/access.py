@@ -12,6 +12,7 @@ from typing import Any, Literal, cast, get_args
 
 from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model import errors
+from membrane_ctrl.model.columns import unit_of
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.web.login_throttle import Admission, Guess, LoginThrottle
 
@@ -220,8 +221,8 @@ ACTIONS = (
     Action("hold", "Hold", "play_arrow"),
     Action("pause", "Pause", "pause"),
     Action("resume", "Resume", "play_circle"),
-    Action("setpoint", "Setpoint", "straighten", "number", "um"),
-    Action("manual", "Manual flow", "tune", "number", "um/s"),
+    Action("setpoint", "Setpoint", "straighten", "number", unit_of("setpoint_um")),
+    Action("manual", "Manual flow", "tune", "number", unit_of("flow_um_per_s")),
     Action("shape_on", "Shape loop on", "toggle_on"),
     Action("shape_off", "Shape loop off", "toggle_off"),
     Action("mark", "Mark", "bookmark", "text"),

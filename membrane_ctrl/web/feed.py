@@ -23,6 +23,7 @@ from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.ctl import Where, connected
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import ring
 from membrane_ctrl.review import catalogue
@@ -31,7 +32,7 @@ from membrane_ctrl.run_files.run_folder import logged
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost
-SIGNALS = ("error_um", "displacement_um", "pump_fraction", "leak_um_per_s", "gauge_pressure_pa", "trim_um")
+SIGNALS = tuple(each.name for each in PUBLISHED)
 _KEPT_S = 3600  # of seconds for the chart; the run's tables have the rest
 _EVENTS_KEPT = 200
 _AGAIN_S = 2.0
@@ -236,10 +237,6 @@ def _number(value: object) -> float:
 SPANS_S = {
     "1 min": 60.0, "10 min": 600.0, "1 h": 3600.0, "8 h": 28_800.0, "1 day": 86_400.0, "1 week": 604_800.0,
     "1 month": 2_678_400.0,
-}  # fmt: skip
-UNITS = {
-    "error_um": "error, um", "displacement_um": "laser, um", "pump_fraction": "pump, share of full scale",
-    "leak_um_per_s": "leak, um/s", "gauge_pressure_pa": "gauge pressure, Pa", "trim_um": "trim, um",
 }  # fmt: skip
 _LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
 _POINTS_MAX = 1200  # as many as a wide screen shows

@@ -12,10 +12,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, zernike_labels
 from membrane_ctrl.run_files import shapes
-from membrane_ctrl.web.feed import UNITS, Series
+from membrane_ctrl.web.feed import Series
 from membrane_ctrl.web.work_pools import WorkPool
 
 T = TypeVar("T")
@@ -43,6 +44,7 @@ def chart(signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, s
 
     `marks` are UTC seconds and texts, oldest first.
     """
+    name = COLUMNS[signal].title
     shift_ms = 0.0 if utc else _offset_s(series) * 1e3
     at_ms = series.utc_s * 1e3 + shift_ms
     lines = [{"xAxis": at_s * 1e3 + shift_ms, "name": text[:_MARK_LETTERS]} for at_s, text in marks[-_MARKS_MOST:]]
@@ -53,12 +55,12 @@ def chart(signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, s
         "grid": {"left": 64, "right": 16, "top": 24, "bottom": 64},
         "tooltip": {"trigger": "axis"},
         "xAxis": {**_axis("UTC" if utc else "local time", 28), "type": "time"},
-        "yAxis": {**_axis(UNITS[signal], 48), "type": "value", "scale": True},
+        "yAxis": {**_axis(name, 48), "type": "value", "scale": True},
         "dataZoom": [{"type": "inside"}, {"type": "slider", "height": 18, "bottom": 6}],
         "series": [
             {**_BAND, "data": low},
             {**_BAND, "data": high, "areaStyle": {"color": "#1f77b4", "opacity": 0.25}},
-            {"type": "line", "name": UNITS[signal], "symbol": "none", "data": mean, "lineStyle": {"width": 1.5},
+            {"type": "line", "name": name, "symbol": "none", "data": mean, "lineStyle": {"width": 1.5},
              "itemStyle": {"color": "#1f77b4"}, "markLine": _mark_lines(lines)},
         ],
     }  # fmt: skip
@@ -92,7 +94,7 @@ def _plain(value: float) -> float | None:
 
 
 def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
-    """Options of the bar chart of the terms from Z4: change since the reference, um, with its standard deviation."""
+    """Options of the bar chart of the terms from Z4: change since the reference, µm, with its standard deviation."""
     shown = slice(FIRST_FIGURE_INDEX - 1, None)
     change_um = figure.coeffs_um - reference.coeffs_um if reference is not None else figure.coeffs_um
     sigma_um = np.sqrt(np.diag(figure.covariance_um2))
@@ -101,16 +103,16 @@ def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[
         "grid": {"left": 56, "right": 12, "top": 16, "bottom": 40},
         "tooltip": {"trigger": "axis"},
         "xAxis": {**_axis("", 0), "type": "category", "data": zernike_labels(FIRST_FIGURE_INDEX)},
-        "yAxis": {**_axis("um", 40), "type": "value"},
+        "yAxis": {**_axis("µm", 40), "type": "value"},
         "series": [
-            {"type": "bar", "name": "change, um", "data": [_plain(v) for v in change_um[shown]]},
-            {"type": "scatter", "name": "sigma, um", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[shown]]},
+            {"type": "bar", "name": "change, µm", "data": [_plain(v) for v in change_um[shown]]},
+            {"type": "scatter", "name": "sigma, µm", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[shown]]},
         ],
     }
 
 
 def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed: int) -> MapPicture:
-    """The figure less `removed` terms: its change since the reference in um, without one its height in um."""
+    """The figure less `removed` terms: its change since the reference in µm, without one its height in µm."""
     from matplotlib import colormaps
     from PIL import Image
 
@@ -127,7 +129,7 @@ def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed:
     file = io.BytesIO()
     Image.fromarray(picture).resize((384, 384), Image.Resampling.NEAREST).save(file, "PNG")
     of = "change since the reference" if change else "height above the vertex"
-    words = f"{of}: {values.max() - values.min():.3g} um PV, {values.std():.3g} um rms, scale +-{scale_um:.3g} um"
+    words = f"{of}: {values.max() - values.min():.3g} µm PV, {values.std():.3g} µm rms, scale ±{scale_um:.3g} µm"
     return MapPicture(file.getvalue(), f"{figure.verdict}; {words}", terms_chart(figure, reference))
 
 

@@ -14,7 +14,7 @@ from membrane_ctrl.control_port.ctl import lock_lines
 from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
-from membrane_ctrl.web.feed import SIGNALS, SPANS_S, UNITS, HoldFeed, history, marks
+from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history, marks
 from membrane_ctrl.web.panels import (
     CHOOSES,
     SessionWatch,
@@ -32,6 +32,7 @@ _SESSION_DIGITS = 8
 _FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
 _LONG_CHART_LIFE_S = 30.0
+_FIRST_SIGNAL = "error_um"  # of the chart
 _CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"  # a phone is narrow
 _PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
 _COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
@@ -77,7 +78,7 @@ class WebPage:
         self._feed = feeds[hold]
         self._logs = self._feed.logs
         self._utc = True
-        self._span, self._signal = "10 min", SIGNALS[0]
+        self._span, self._signal = "10 min", _FIRST_SIGNAL
         self._removed = "nothing"
         self._charted_s = -1e9
         self._drawn: tuple[float, str] = (0.0, "")
@@ -156,7 +157,7 @@ class WebPage:
         with ui.row().classes("items-center"):
             ui.toggle(list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)).props("dense")
             ui.select(
-                dict(zip(SIGNALS, (UNITS[name] for name in SIGNALS), strict=True)), value=self._signal,
+                {column.name: column.title for column in PUBLISHED}, value=self._signal,
                 on_change=lambda e: self._set("_signal", e.value),
             ).props('dense aria-label="signal"')  # fmt: skip
         self._chart = ui.echart({"series": []}).classes("w-full").style("height: 22rem")

@@ -105,7 +105,7 @@ async def test_the_terminal_has_a_line_of_each(
     for line, (name, says) in zip(lines, SAID.items(), strict=True):
         assert says.lower() in line.lower()
         assert ("no contact" in line) is (name not in ("north", "reader")), line
-        assert ("0.250 um" in line) is (name in ("north", "reader")), line
+        assert ("0.25 µm" in line) is (name in ("north", "reader")), line
         assert "_ssl.c" not in line, "for people, not for programmers"
 
 

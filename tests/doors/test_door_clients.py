@@ -300,11 +300,11 @@ async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
     async with held(tmp_path) as run, doors(tmp_path, settings):
         found = await said_by(OPCUA_CLIENT, ports)
         assert found == {
-            "error_um": 0.25, "unit": "um", "state": "hold", "write": "BadUserAccessDenied",
+            "error_um": 0.25, "unit": "µm", "state": "hold", "write": "BadUserAccessDenied",
             "admin": "BadIdentityTokenRejected", "setpoint": "opcua: setpoint: done", "keep": "BadNodeIdUnknown",
         }  # fmt: skip
         found = await said_by(CA_CLIENT, ports)
-        assert found == {"error_um": 0.25, "unit": "um", "write": "ECA_NOWTACCESS", "answer": "epics: setpoint: done"}
+        assert found == {"error_um": 0.25, "unit": "µm", "write": "ECA_NOWTACCESS", "answer": "epics: setpoint: done"}
         found = await said_by(PVA_CLIENT, ports)
         assert found == {"error_um": 0.25, "state": "hold", "write": "refused", "answer": "epics: mark: done"}
         assert [(each.kind, each.text) for each in run.asked] == [("setpoint", ""), ("setpoint", ""), ("mark", "pva")]
@@ -325,7 +325,7 @@ async def test_opc_ua_and_epics_survive_the_hold(tmp_path: Path) -> None:
 async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     async with held(tmp_path) as run, doors(tmp_path, SERVERS.format(**ports)):
-        finite = "Setpoint: enter a finite number in um"
+        finite = "Setpoint: enter a finite number in µm"
         assert await said_by(HOSTILE_OPCUA, ports) == {
             "nan": finite, "text": f"Setpoint: enter a number in um: 'abc' {NO_NUMBER}",
             "none": f"Setpoint: enter a number in um: '' {NO_NUMBER}",

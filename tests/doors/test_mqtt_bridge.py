@@ -218,7 +218,7 @@ async def test_a_text_that_is_no_number_is_refused(tmp_path: Path, text: str) ->
     door = door_to(tmp_path)
     async with port_run(tmp_path) as run:
         for payload in (text, text.encode()):
-            assert "Setpoint: enter a number in um" in await door.ask("mqtt", "setpoint", payload)
+            assert "Setpoint: enter a number in µm" in await door.ask("mqtt", "setpoint", payload)
         assert run.asked == []
 
 

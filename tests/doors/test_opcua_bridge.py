@@ -143,7 +143,7 @@ async def test_a_latch_in_one_message_with_many_calls_does_not_wait_for_them(tmp
 async def test_a_text_that_is_no_number_is_refused(tmp_path: Path, text: str) -> None:
     async with bridge(tmp_path) as (run, url), client_of(url) as client:
         mirror, space = await mirror_of(client)
-        assert "Setpoint: enter a number in um" in await mirror.call_method(f"{space}:setpoint", text)
+        assert "Setpoint: enter a number in µm" in await mirror.call_method(f"{space}:setpoint", text)
         assert run.asked == []
 
 

@@ -38,7 +38,7 @@ async def test_the_terminal_lists_all_holds(tmp_path: Path, capsys: pytest.Captu
         south.tick()
         assert await asyncio.to_thread(command, ["ctl", "fleet", str(file)]) == Exit.DEVICE_FAILED
         north, faulty, spare = capsys.readouterr().out.splitlines()
-        assert north.split()[:4] == ["north", "hold", "0.250", "um"]
+        assert north.split()[:4] == ["north", "hold", "0.25", "µm"]
         assert faulty.split()[:2] == ["south", "fault"]
         assert spare.startswith("spare  no contact")
         assert "no hold is listening" in spare
