@@ -60,7 +60,6 @@ class ShapeView:
     sag_change_um: float  # since the reference: the first usable estimate of a settled hold
     change_sigma_um: float  # of that change, noise only
     reference_s: float  # when the reference was taken
-    trim_um: float
     cycles: int
     rejected: int
     note: str
@@ -210,7 +209,6 @@ class ConsoleModel:
             sag_change_um=estimate.sag_um - since.sag_um if estimate and since else math.nan,
             change_sigma_um=math.hypot(estimate.sag_sigma_um, since.sag_sigma_um) if estimate and since else math.nan,
             reference_s=since.time_s if since else math.nan,
-            trim_um=row.trim_um if row else math.nan,
             cycles=self._cycles,
             rejected=self._rejected,
             note=_acquisition_words(status.acquisition) or loop or reason,

@@ -19,6 +19,7 @@ from rich.live import Live
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import keys, model, why
+from membrane_ctrl.console.quantities import labelled
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.model import clock, events, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.processes import child, ring
@@ -39,15 +40,14 @@ def line(view: model.ConsoleView) -> str:
     if view.silent_s or row is None:
         silent = f"no tick for {view.silent_s:.1f} s" if row else view.why
         return f"{view.elapsed_s:9.1f} s  {silent}"
-    shape = view.shape
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
-        f"error {why.number(row.error_um, 2, sign=True):>7} um",
+        labelled(row, "error_um", sign=True, width=7),
         f"pump {why.percent(row.pump_fraction):>5}",
-        f"leak {why.number(row.leak_um_per_s, 2)} um/s" + (" TOO TIGHT" if view.too_tight else ""),
+        labelled(row, "leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
         *([f"held by {why.holders(row)}"] if math.isfinite(row.estimate_sigma_um) else []),
-        f"shape {_shape_words(view)} trim {why.number(shape.trim_um, 2, sign=True)} um",
-        f"late {why.number(row.lateness_ms, 1)} ms",
+        f"shape {_shape_words(view)} {labelled(row, 'trim_um', sign=True)}",
+        labelled(row, "lateness_ms"),
         view.why,
     ]
     parts += [f"LOCKED {lock}" for lock in view.locks]

@@ -12,8 +12,10 @@ from rich.text import Text
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
 from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
-from membrane_ctrl.console.why import NONE, duration, holders, number, percent
-from membrane_ctrl.model import telemetry
+from membrane_ctrl.console.quantities import labelled, quantity
+from membrane_ctrl.console.why import duration, holders, number, percent
+from membrane_ctrl.model import columns, telemetry
+from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
 
 _LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
@@ -197,7 +199,7 @@ def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]
         ("flow", _flow(row)),
         ("gas", _gas(view, row)),
         ("", Text()),
-        *_shape(view.shape),
+        *_shape(view.shape, row),
         ("", Text()),
         ("lateness", _lateness(view, row)),
         ("faults", _faults(view)),
@@ -216,9 +218,10 @@ def _error(view: ConsoleView, config: Config) -> Text:
     assert row is not None
     inside = abs(row.error_um) <= config.limits.band_um
     style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
-    text = Text(f"{number(row.error_um, 2, 'um', sign=True):>10}", style=style)
-    mean, std = number(view.error_mean_um, 2, sign=True), number(view.error_std_um, 2)
-    text.append(f"   last minute: mean {mean}, std {std} um, ", style="default")
+    error = COLUMNS["error_um"]
+    text = Text(f"{quantity(row, 'error_um', sign=True):>10}", style=style)
+    mean, std = error.format_value(view.error_mean_um, sign=True), error.format_value(view.error_std_um)
+    text.append(f"   last minute: mean {mean}, std {std} {error.unit}, ", style="default")
     text.append(f"{percent(view.in_band_fraction)} within ±{config.limits.band_um:g}", style="default")
     return text
 
@@ -227,68 +230,83 @@ def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[t
     """The bars of the last seconds with their labels; a blank label is not an item that can be omitted."""
     shown = view.trend_um[-max(1, seconds) :]
     full_um = full_scale(shown, config.limits.band_um * _CALM)
-    labels = [f"+{full_um:g} um", *[" "] * (2 * rows - 2), f"-{full_um:g} um"]
+    labels = [f"+{full_um:g} µm", *[" "] * (2 * rows - 2), f"-{full_um:g} µm"]
     return list(zip(labels, signed_bars(shown, full_um, config.limits.band_um, rows), strict=True))
 
 
+# Published columns that the lines below show each in its own way; a line shows the others of its group behind them.
+_PLACED = frozenset({
+    "error_um", "displacement_um", "setpoint_um", "target_um", "pump_fraction", "vent_fraction", "flow_um_per_s",
+    "leak_um_per_s", "trim_um", "lateness_ms", "missed_ticks",
+})  # fmt: skip
+
+
+def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
+    """Known values of the published columns of some groups that have no place of their own."""
+    shown = [each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED]
+    return "".join(f"  {labelled(row, name)}" for name in shown if math.isfinite(getattr(row, name)))
+
+
 def _mirror(row: telemetry.TelemetryRow) -> Text:
-    text = Text.assemble("reading ", (number(row.displacement_um, 2, sign=True), "bold"))
-    text.append(f"  setpoint {number(row.setpoint_um, 2, 'um', sign=True)}")
+    text = Text.assemble("reading ", (quantity(row, "displacement_um", sign=True), "bold"))
+    text.append(
+        f"  {labelled(row, 'setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"
+    )
     if math.isfinite(row.estimate_sigma_um):
-        text.append(f"  centre ± {number(row.estimate_sigma_um, 3, 'um')} by {holders(row)}", style="green")
+        text.append(f"  centre ± {quantity(row, 'estimate_sigma_um')} by {holders(row)}", style="green")
     if math.isfinite(row.truth_displacement_um):
-        text.append(f"  truth {number(row.truth_displacement_um, 2, 'um', sign=True)}", style="cyan")
-        text.append(f" (laser {number(row.truth_laser_bias_um, 2, sign=True)})", style="dim")
+        text.append(f"  truth {quantity(row, 'truth_displacement_um', sign=True)}", style="cyan")
+        text.append(f" (laser {quantity(row, 'truth_laser_bias_um', sign=True)})", style="dim")
     return text
 
 
 def _pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
+    flow = COLUMNS["flow_um_per_s"]
     text = level_bar(row.pump_fraction, _BAR_WIDTH)
-    text.append(f" {percent(row.pump_fraction)}, {number(row.flow_um_per_s, 2)} of ", style="default")
-    text.append(f"{most_um_per_s:g} um/s", style="default")
+    text.append(f" {percent(row.pump_fraction)}, {flow.format_value(row.flow_um_per_s)} of ", style="default")
+    text.append(f"{most_um_per_s:g} {flow.unit}{_others(row, columns.Group.PUMP)}", style="default")
     if row.vent_fraction > 0:
         text.append(f"  vent {percent(row.vent_fraction)} open", style="yellow")
     return text
 
 
 def _flow(row: telemetry.TelemetryRow) -> Text:
-    parts = [("P", row.p_um_per_s), ("I", row.i_um_per_s), ("D", row.d_um_per_s)]
-    parts += [("feed-forward", row.feedforward_um_per_s)]
-    return Text("  ".join(f"{name} {number(value, 2, sign=True)}" for name, value in parts) + " um/s")
+    terms = columns_of(TERMS)
+    parts = [f"{each.label} {each.format_value(getattr(row, each.name), sign=True)}" for each in terms]
+    return Text(f"{'  '.join(parts)} {terms[0].unit}")
 
 
 def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
-    text = Text(f"leak {number(row.leak_um_per_s, 2, 'um/s')}")
+    text = Text(labelled(row, "leak_um_per_s"))
     if view.too_tight:
         text.append(" too tight: open the bleed", style="bold yellow")
-    ambient_hpa = row.ambient_pressure_pa / 100.0
-    text.append(f"  gauge {number(row.gauge_pressure_pa, 1, 'Pa')}  air {number(ambient_hpa, 2, 'hPa')}")
-    text.append(f" {number(row.air_temperature_c, 2, '°C')}")
-    return text
+    return text.append(_others(row, columns.Group.ENVIRONMENT))
 
 
-def _shape(shape: ShapeView) -> list[tuple[str, RenderableType]]:
+def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
-    state.append(f"  trim {number(shape.trim_um, 2, 'um', sign=True)}", style="default")
+    state.append(f"  {labelled(row, 'trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}", style="default")
     estimate = shape.estimate
     change = number(shape.sag_change_um, 3, sign=True)
-    if change != NONE:
+    if change != MISSING:
         sigma = number(shape.change_sigma_um, 3)
-        state.append(f"  sag {change} ± {sigma} um since {duration(shape.reference_s)}", style="default")
+        state.append(f"  sag {change} ± {sigma} µm since {duration(shape.reference_s)}", style="default")
     if shape.note:
         state.append(f"  {shape.note}", style="yellow")
     if estimate is None:
         return [("shape", state), ("cycle", Text("none yet", style="dim"))]
     cycle = Text(estimate.verdict, style=_VERDICT_STYLES[estimate.verdict])
     cycle.append(f"  {duration(shape.age_s)} ago, {estimate.kind}, ", style="default")
-    cycle.append(f"residual {number(estimate.slope_residual_urad, 1, 'urad')}, ", style="default")
+    cycle.append(f"residual {number(estimate.slope_residual_urad, 1, 'µrad')}, ", style="default")
     cycle.append(f"in {number(1e3 * estimate.latency_s, 0, 'ms')}", style="default")
     cycle.append(f"  {shape.rejected}/{shape.cycles} rejected", style="yellow" if shape.rejected else "dim")
     return [("shape", state), ("cycle", cycle)]
 
 
 def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
-    text = Text(f"{number(row.lateness_ms, 1, 'ms')}, worst of the minute {number(view.lateness_max_ms, 1, 'ms')}")
+    late = COLUMNS["lateness_ms"]
+    text = Text(f"{quantity(row, 'lateness_ms')}, worst of the minute {late.format_value(view.lateness_max_ms)}")
+    text.append(f" {late.unit}{_others(row, columns.Group.TIMING)}")
     missed = int(row.missed_ticks)
     text.append(f", {missed} of {int(row.tick) + missed} ticks missed", style="yellow" if missed else "default")
     return text

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.columns import MISSING
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 
@@ -54,7 +55,7 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
         return told
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
-        return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} um to go"
+        return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} µm to go"
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_outside(row)}"
     return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
@@ -91,9 +92,9 @@ def _outside(row: TelemetryRow) -> str:
     """Direction of the deviation, and the pump's response to it (error = setpoint - reading)."""
     if row.error_um > 0:
         at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
-        return f"bowl {row.error_um:.1f} um too shallow, {_flow(row)}{', its limit' if at_limit else ''}"
+        return f"bowl {row.error_um:.1f} µm too shallow, {_flow(row)}{', its limit' if at_limit else ''}"
     waits = row.flow_um_per_s <= 0
-    return f"bowl {-row.error_um:.1f} um too deep, {_flow(row)}{', only the leak can lower it' if waits else ''}"
+    return f"bowl {-row.error_um:.1f} µm too deep, {_flow(row)}{', only the leak can lower it' if waits else ''}"
 
 
 def _balance(row: TelemetryRow) -> str:
@@ -112,16 +113,13 @@ def _balance(row: TelemetryRow) -> str:
 def _flow(row: TelemetryRow) -> str:
     if row.flow_um_per_s <= 0:
         return "pump is at 0"
-    return f"pump gives {row.flow_um_per_s:.2f} um/s"
-
-
-NONE = "–"  # for a missing number
+    return f"pump gives {row.flow_um_per_s:.2f} µm/s"
 
 
 def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
     """Format `value` with its unit."""
     if not math.isfinite(value):
-        return NONE
+        return MISSING
     figure = f"{value:{'+' if sign else ''}.{digits}f}"
     return f"{figure} {unit}" if unit else figure
 
@@ -134,7 +132,7 @@ def percent(fraction: float, digits: int = 0) -> str:
 def duration(seconds_s: float) -> str:
     """Format a time span: 7 s, 2:05, 3:02:05, 4 d 03:02:05."""
     if not math.isfinite(seconds_s):
-        return NONE
+        return MISSING
     minutes, seconds = divmod(int(seconds_s), 60)
     hours, minutes = divmod(minutes, 60)
     days, hours = divmod(hours, 24)

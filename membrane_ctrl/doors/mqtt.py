@@ -32,6 +32,7 @@ from membrane_ctrl.doors.mqtt_inbox import HandleMessage, Inbox, Reports
 from membrane_ctrl.doors.mqtt_owner import NameOwnership, OwnerClaim
 from membrane_ctrl.doors.names import TABLE, Door, Published
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.columns import QUANTITY_OF_UNIT
 
 _LEAVES_S = 2.0
 _ANSWER_S = 5.0  # of the broker to each message
@@ -42,7 +43,6 @@ _PACKET_BYTES_MAX = 1 << 20  # a broker of MQTT 5 delivers no larger message
 _LOOK_S = 0.5  # how often the availability is compared with the hold
 _REPORT_PAUSE_S = 0.02
 _STATE_LETTERS = 255  # the longest state that Home Assistant takes
-_CLASSES = {"Pa": "pressure", "°C": "temperature"}  # of Home Assistant; it knows no micrometres
 _UNSUPPORTED_VERSION = (1, 132)  # reason codes of MQTT 3.1.1 and 5
 
 
@@ -349,6 +349,6 @@ def _sensor(each: Published, name: str) -> dict[str, Any]:
     found |= {"value_template": f"{{{{ value_json.{each.name} }}}}", "state_class": "measurement"}
     if each.unit:
         found["unit_of_measurement"] = each.unit
-    if each.unit in _CLASSES:
-        found["device_class"] = _CLASSES[each.unit]
+    if each.unit in QUANTITY_OF_UNIT:  # Home Assistant has no class for lengths of micrometres
+        found["device_class"] = QUANTITY_OF_UNIT[each.unit]
     return found

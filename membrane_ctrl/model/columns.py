@@ -15,6 +15,8 @@ from typing import Any
 
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
 
+MISSING = "–"  # shown for a value that is not known
+
 # By the end of an identifier: the unit for people. The first one that fits counts.
 UNIT_SUFFIXES: dict[str, str] = {
     "_um_per_s": "µm/s",
@@ -25,6 +27,9 @@ UNIT_SUFFIXES: dict[str, str] = {
     "_s": "s",
     "_innovation": "σ",
 }
+
+# What a unit measures, where the unit alone gives it.
+QUANTITY_OF_UNIT: dict[str, str] = {"Pa": "pressure", "°C": "temperature"}
 
 
 def unit_of(name: str) -> str:
@@ -166,15 +171,22 @@ class TelemetryColumn:
         return f"{self.label} {self.unit}".rstrip()
 
     @property
+    def short_label(self) -> str:
+        """Label without what its unit gives: `gauge` for `gauge pressure` in Pa."""
+        quantity = QUANTITY_OF_UNIT.get(self.unit)
+        return self.label if quantity is None else self.label.removesuffix(f" {quantity}")
+
+    @property
     def twin_only(self) -> bool:
         """Whether it is known of a simulated mirror only."""
         return self.entity.startswith("/truth/")
 
-    def format_value(self, value: float | None) -> str:
-        """Return a value with its decimals; a dash for a missing one."""
+    def format_value(self, value: float | None, sign: bool = False) -> str:
+        """Return a value with its decimals, with `sign` also a plus; a dash for a missing value."""
         if value is None or not math.isfinite(value):
-            return "-"
-        return f"{value:z.{self.decimals}f}"
+            return MISSING
+        plus = "+" if sign else ""
+        return f"{value:{plus}z.{self.decimals}f}"
 
 
 _TABLE_KEY = "column"

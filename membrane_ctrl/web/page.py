@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from nicegui import ui
 
 from membrane_ctrl.control_port.ctl import lock_lines
-from membrane_ctrl.model.columns import PUBLISHED
+from membrane_ctrl.model.columns import MISSING, PUBLISHED
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
 from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history, marks
@@ -150,7 +150,7 @@ class WebPage:
             for column in PUBLISHED:
                 with ui.card().classes("q-pa-sm gap-0"):
                     ui.label(column.title).classes("text-caption")
-                    found[column.name] = ui.label("-").classes("text-h6").props(f'data-field="{column.name}"')
+                    found[column.name] = ui.label(MISSING).classes("text-h6").props(f'data-field="{column.name}"')
         return found
 
     def _build_chart(self) -> None:
@@ -221,7 +221,7 @@ class WebPage:
         seen = self._feed.seen
         status, row = seen.status, seen.status.get("row") or {}
         silent = seen.silent
-        state = "no contact" if silent else str(status.get("state", "-"))
+        state = "no contact" if silent else str(status.get("state", MISSING))
         self._name.set_text(" ".join(part for part in (self._hold, seen.name or "no hold") if part))
         self._state.set_text(state)
         colour = "grey" if silent else _COLOURS.get(state, "warning")

@@ -41,13 +41,13 @@ def test_everything_a_person_wants_is_there() -> None:
     page = "\n".join(drawn(held()))
     for words in (
         "hold for 1:15",
-        "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward",
+        "pump gives 1.14 µm/s: +1.24 leak, -0.11 feed-forward",
         "within ±2",
-        "truth +0.03 um (laser +0.10)",
-        "29 %, 1.14 of 5.3 um/s",
-        "leak 1.24 um/s  gauge 600.0 Pa  air 1013.25 hPa 20.01 °C",
-        "tracking  trim +0.12 um  sag +0.030 ± 0.017 um since 6 s",
-        "ok  1 s ago, fringes, residual 3.1 urad, in 31 ms  0/2 rejected",
+        "truth +0.03 µm (laser",
+        "29 %, 1.140 of 5.3 µm/s",
+        "leak 1.240 µm/s  gauge 600.0 Pa  ambient 101325.0 Pa  air 20.01 °C",
+        "tracking  trim +0.12 µm  sag +0.030 ± 0.017 µm since 6 s",
+        "ok  1 s ago, fringes, residual 3.1 µrad, in 31 ms  0/2 rejected",
         "worst of the minute",
         "faults none",
         "run 1:15, 45 s left · logs/20261121T031200Z-demo",
@@ -106,7 +106,7 @@ def test_a_wide_terminal_shows_a_longer_trend() -> None:
     for row in rows(150.0):
         model.take_row(row)
     page = drawn(model, now_s=150.0, width=160)
-    upper, lower = (next(row for row in page if f"{sign}1 um" in row or f"{sign}2 um" in row) for sign in "+-")
+    upper, lower = (next(row for row in page if f"{sign}1 µm" in row or f"{sign}2 µm" in row) for sign in "+-")
     both = [a != " " or b != " " for a, b in zip(upper[12:-2], lower[12:-2], strict=True)]
     assert sum(both) > 140
 
@@ -198,7 +198,7 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
 
 def test_plain_line_has_the_second_in_it() -> None:
     said = line(held().view(75.0))
-    for words in ("75.0 s  hold", "error", "pump  29 %", "leak 1.24 um/s", "shape tracking ok 1 s", "45 s left"):
+    for words in ("75.0 s  hold", "error", "pump  29 %", "leak 1.240 µm/s", "shape tracking ok 1 s", "45 s left"):
         assert words in said
     assert "\n" not in said
     assert "no tick for 10.0 s" in line(held().view(84.98))
@@ -248,6 +248,6 @@ def test_level_bar(fraction: float, bar: str) -> None:
 def test_words() -> None:
     spans_s = (0.9, 59.9, 60.0, 3599.0, 3600.0, 90061.0, math.nan)
     assert [duration(s) for s in spans_s] == ["0 s", "59 s", "1:00", "59:59", "1:00:00", "1 d 01:01:01", "–"]
-    assert number(-0.125, 2, "um", sign=True) == "-0.12 um"
-    assert number(math.inf, 2, "um") == "–"
+    assert number(-0.125, 2, "µm", sign=True) == "-0.12 µm"
+    assert number(math.inf, 2, "µm") == "–"
     assert percent(0.254) == "25 %"

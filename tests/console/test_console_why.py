@@ -20,19 +20,19 @@ def line(told: str = "", fault: str = "", **changes: float) -> str:
 
 
 def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
-    assert line() == "pump gives 1.14 um/s: +1.24 leak, -0.11 feed-forward"
+    assert line() == "pump gives 1.14 µm/s: +1.24 leak, -0.11 feed-forward"
     assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == ("pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward")
 
 
 def test_settle_says_so() -> None:
-    assert line(state=State.SETTLE).startswith("settling: pump gives 1.14 um/s")
+    assert line(state=State.SETTLE).startswith("settling: pump gives 1.14 µm/s")
 
 
 @pytest.mark.parametrize(
     ("target_um", "flow_um_per_s", "said"),
     [
-        (25.0, 5.3, "pump gives 5.30 um/s: filling, 24.9 um to go"),
-        (-25.0, 0.0, "pump is at 0: waiting for the leak, 25.1 um to go"),
+        (25.0, 5.3, "pump gives 5.30 µm/s: filling, 24.9 µm to go"),
+        (-25.0, 0.0, "pump is at 0: waiting for the leak, 25.1 µm to go"),
     ],
 )
 def test_inflate_says_how_far(target_um: float, flow_um_per_s: float, said: str) -> None:
@@ -41,10 +41,10 @@ def test_inflate_says_how_far(target_um: float, flow_um_per_s: float, said: str)
 
 def test_outside_the_band_says_which_way_and_what_is_done() -> None:
     assert line(error_um=-6.9, flow_um_per_s=0.0) == (
-        "outside the band: bowl 6.9 um too deep, pump is at 0, only the leak can lower it"
+        "outside the band: bowl 6.9 µm too deep, pump is at 0, only the leak can lower it"
     )
     assert line(error_um=6.9, flow_um_per_s=5.3, flow_wanted_um_per_s=9.0) == (
-        "outside the band: bowl 6.9 um too shallow, pump gives 5.30 um/s, its limit"
+        "outside the band: bowl 6.9 µm too shallow, pump gives 5.30 µm/s, its limit"
     )
     assert line(error_um=2.0) == line(error_um=0.0)  # the edge is inside
 

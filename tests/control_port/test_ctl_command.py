@@ -141,7 +141,7 @@ def test_status_for_a_person() -> None:
     lines = status_lines({"run": "r", "commander": "unix:ann", **status_table(status)})
     assert "FAULT 40 late: the loop is late; close other programs" in lines
     assert any(line.split() == ["error", "0.25", "µm"] for line in lines)
-    assert any(line.split() == ["leak", "-", "µm/s"] for line in lines)
+    assert any(line.split() == ["leak", "–", "µm/s"] for line in lines)
     assert any("unix:ann" in line for line in lines)
 
 
