@@ -107,7 +107,7 @@ def test_what_was_learned_of_the_pump_is_drawn_with_its_error(night: Path, tmp_p
 
 @pytest.mark.parametrize(
     ("config", "plots"),
-    [({}, 0), ({"pump": {"probe_um": 0.1}}, 1), ({"estimator": {"process_value": "estimate"}}, 2)],
+    [({}, 0), ({"pump": {"probe_um": 0.1}}, 1), ({"estimator": {"process_value": "estimate"}}, 3)],
 )
 def test_the_loop_s_tab_has_what_the_loop_learns(config: dict[str, dict[str, Any]], plots: int) -> None:
     assert len(learned(Config.model_validate(config))) == plots
