@@ -159,7 +159,7 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     status = status.after_event(MaintenanceOver("calibrate", "the geometry fits again"))
     lines = status_lines({"run": "r", **status_table(status)})
     assert not any("maintenance" in line for line in lines)
-    assert "  geometry       g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
+    assert "  geometry          g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
 
 
 def test_nobody_there_is_one_line_and_exit_code_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
