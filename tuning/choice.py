@@ -23,16 +23,13 @@ from tuning.proposal import candidates, design
 from tuning.rig import HoldRig
 
 
-def require_an_answer(yes: bool, name: str, known: bool) -> None:
-    """Raises InputError before anything moves if nobody could choose the gains.
-
-    If the names are `known`, i.e. the session is not from an earlier version, it refuses an unknown one too.
-    """
+def require_an_answer(yes: bool, name: str) -> None:
+    """Raises InputError before anything moves if nobody could choose the gains, or the name is no candidate's."""
     if not (yes or name or sys.stdin.isatty()):
         raise InputError(
             "the gains to apply are chosen on a terminal; elsewhere add --yes (the proposal) or --choose NAME"
         )
-    if name and known and name not in design.NAMES:
+    if name and name not in design.NAMES:
         raise InputError(f"--choose {name}: not a candidate; known: {', '.join(design.NAMES)}")
 
 

@@ -31,7 +31,7 @@ _MOVES = frozenset({"characterise", "observe", "apply", "verify"})
 
 def run_session(options: TuneOptions) -> int:
     """Run all steps that are not done yet and return the exit code; raises like `one_step`."""
-    choice.require_an_answer(options.yes, options.choose, known=options.session is None)
+    choice.require_an_answer(options.yes, options.choose)
     with opening.opened(options) as (folder, rig, progress):
         if options.page:
             progress.say(f"live page: {_served(folder, options)}session")
@@ -63,7 +63,7 @@ def one_step(step: str, options: TuneOptions) -> int:
     Raises InputError, DeviceError or RejectedError, and then holds the mirror with the last good gains.
     """
     if step == "apply":
-        choice.require_an_answer(options.yes, options.choose, known=options.session is None)
+        choice.require_an_answer(options.yes, options.choose)
     if step not in _MOVES:
         folder = opening.folder_of(options, None)
         with writing(folder.path, DeviceError):

@@ -208,7 +208,7 @@ def _heard_before(config: Config, run_dir: Path) -> Heard | None:
         run = path.parent
         if run.name > run_dir.name or _bench_name(run_folder.read_config(run, [])) != _bench_name(config):
             continue
-        with suppress(OSError, ValueError, RecursionError):  # damaged, or of another version: an older one
+        with suppress(OSError, ValueError, RecursionError):  # damaged: take an older one
             table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
             if isinstance(table, dict) and plain_json.take_checksum(table):
                 heard: Heard = object_codec.Decoder((Heard(),), {}).decode(table, Heard)

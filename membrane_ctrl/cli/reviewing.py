@@ -131,9 +131,7 @@ def export_run(
         typer.Option("--streams", help="Stream to write: a path, a field, shapes or events; repeatable."),
     ] = None,
     start: FromOption = None,
-    end: Annotated[
-        str | None, typer.Option("--to", "--until", help="End of the part, written as for --from.")
-    ] = None,
+    end: Annotated[str | None, typer.Option("--to", help="End of the part, written as for --from.")] = None,
 ) -> int:
     """Export a run's columns for other programs."""
     from membrane_ctrl.review.runs import export_command

@@ -3,7 +3,7 @@
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -22,27 +22,17 @@ _PARTS_MAX = 50
 _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
-def load(path: str | Path, model: type[Model], follow: bool = True, retired: Iterable[tuple[str, str]] = ()) -> Model:
+def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
     """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source (`model.files`).
-
-    Keys that are `retired` (table, key) are ignored.
 
     Raises InputError with one line that names the file, the field and a valid value.
     """
     path = Path(path)
     tables = read_toml(path, follow)
-    drop(tables, retired)
     optics = tables.get("optics")
     if isinstance(optics, dict):
         with_height_map(optics.get("geometry"), path, follow)
     return parse(tables, model, str(path))
-
-
-def drop(tables: dict[str, Any], keys: Iterable[tuple[str, str]]) -> None:
-    """Remove (table, key)s, where they are."""
-    for table, key in keys:
-        if isinstance(inner := tables.get(table), dict):
-            inner.pop(key, None)
 
 
 def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:

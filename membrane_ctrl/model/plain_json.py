@@ -59,7 +59,7 @@ def _finite(value: Any) -> Any:
 
 # Checksums of a run's small files. A JSON object gets a last member `crc32` over its values, not their spelling:
 # other programs may rewrite it. The configuration gets a comment as its first line, with the checksum of its text.
-# Files without a checksum (from an earlier version, or a later note) are accepted.
+# Files without a checksum (annotations, files edited by a person) are accepted.
 
 KEY = "crc32"
 _COMMENT = "# as run; CRC-32 of the text below: "

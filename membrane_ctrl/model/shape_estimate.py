@@ -2,7 +2,7 @@
 
 One line of JSON with the numbers and words, then the coefficients, then the upper half of the covariance in single
 precision: a variance to 1e-7 is more precise than its noise model, and the controller's inputs must be recorded
-exactly. Earlier versions also wrote whole matrices and doubles. A reader checks every length, type and range first,
+exactly. A reader checks every length, type and range first,
 because a run folder may come from anywhere.
 """
 
@@ -58,7 +58,7 @@ _WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
 _ARRAYS = ("coeffs_um", "covariance_um2")
 _OTHERS = {"reason", "cycle", "tracking_lost"}
 NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
-_KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms", "symmetric", "single"}
+_KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms"}
 _UPPER = np.triu_indices(ZERNIKE_TERMS)
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * ZERNIKE_TERMS
@@ -79,7 +79,7 @@ def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
 
 def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
     """Bytes of an estimate's numbers and words, coefficients (terms,) and upper half (COVARIANCE_UPPER_SIZE,)."""
-    line = json.dumps({**head, "terms": ZERNIKE_TERMS, "symmetric": True, "single": True}, default=float)
+    line = json.dumps({**head, "terms": ZERNIKE_TERMS}, default=float)
     arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
     return line.encode() + b"\n" + arrays
 
@@ -93,49 +93,41 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
         head = json.loads(line)
     except RecursionError:
         raise ValueError("shape estimate: not one flat JSON object") from None
-    symmetric, single = _checked(head)
-    count = COVARIANCE_UPPER_SIZE if symmetric else ZERNIKE_TERMS**2
-    if len(arrays) != _COEFFS_BYTES + count * (4 if single else 8):
+    _require_valid(head)
+    if len(arrays) != _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE:
         raise ValueError(f"shape estimate: {len(arrays)} bytes of arrays do not fit its first line")
     coeffs_um = np.frombuffer(arrays, dtype="<f8", count=ZERNIKE_TERMS)
-    values = np.frombuffer(arrays, dtype="<f4" if single else "<f8", offset=_COEFFS_BYTES)
+    values = np.frombuffer(arrays, dtype="<f4", offset=_COEFFS_BYTES)
     if np.isinf(coeffs_um).any() or np.isinf(values).any():
         raise ValueError("shape estimate: infinite coefficient or covariance")
     covariance = np.empty((ZERNIKE_TERMS, ZERNIKE_TERMS))
-    if symmetric:
-        rows, columns = _UPPER
-        covariance[rows, columns] = covariance[columns, rows] = values
-    else:
-        covariance[:] = values.reshape(ZERNIKE_TERMS, ZERNIKE_TERMS)
+    rows, columns = _UPPER
+    covariance[rows, columns] = covariance[columns, rows] = values
     return ShapeEstimate(**head, coeffs_um=coeffs_um.copy(), covariance_um2=covariance)
 
 
-def _checked(head: Any) -> tuple[bool, bool]:
-    """Whether the covariance is symmetric and in singles; reduces `head` to the estimate's fields. Raises
-    ValueError."""
-    if not isinstance(head, dict) or not set(head) <= _KEYS:
-        raise ValueError("shape estimate: unknown fields in the first line")
-    layout = (head.pop("terms", None), head.pop("symmetric", None), head.pop("single", None))
-    if layout[0] != ZERNIKE_TERMS:
-        raise ValueError(f"shape estimate of {str(layout[0])[:8]} Zernike terms; this program has {ZERNIKE_TERMS}")
-    if not all(isinstance(flag, bool) for flag in layout[1:]):
-        raise ValueError("shape estimate: the layout of its covariance is not stated")
+def _require_valid(head: Any) -> None:
+    """Reduce `head` to the estimate's fields. Raises ValueError if one is missing, unknown or of a wrong type."""
+    if not isinstance(head, dict) or set(head) != _KEYS:
+        raise ValueError("shape estimate: missing or unknown fields in the first line")
+    terms = head.pop("terms")
+    if terms != ZERNIKE_TERMS:
+        raise ValueError(f"shape estimate of {str(terms)[:8]} Zernike terms; this program has {ZERNIKE_TERMS}")
     for name in NUMBERS:
-        value = head.get(name, math.nan)  # fields missing in older versions are NaN
+        value = head[name]
         if type(value) not in (float, int) or abs(value) > _LARGEST:
             raise ValueError(f"shape estimate: {name} is not a number")
         head[name] = float(value)
     if math.isnan(head["time_s"]):
         raise ValueError("shape estimate: no time")
     for name, words in _WORDS.items():
-        if head.get(name) not in words:
+        if head[name] not in words:
             raise ValueError(f"shape estimate: {name} is none of {', '.join(words)}")
-    cycle = head.setdefault("cycle", 0)
-    if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head.setdefault("reason", ""), str):
+    cycle = head["cycle"]
+    if type(cycle) is not int or not 0 <= cycle < 2**63 or not isinstance(head["reason"], str):
         raise ValueError("shape estimate: cycle or reason has a wrong type")
-    if not isinstance(head.setdefault("tracking_lost", False), bool):
+    if not isinstance(head["tracking_lost"], bool):
         raise ValueError("shape estimate: tracking_lost is neither true nor false")
-    return layout[1], layout[2]
 
 
 # Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds 0.06 rad per pixel

@@ -70,7 +70,7 @@ def open_run(folder: Path) -> RecordedRun:
     """Open a run. Raises InputError, naming the folder and what is missing."""
     if not (folder / "config.toml").is_file():
         raise InputError(f"{folder}: not a run folder (no config.toml)")
-    inputs = inputs_file.open_inputs(folder)
+    inputs = inputs_file.InputsReader(folder)
     if not inputs.paths:
         raise InputError(f"{folder}: no recorded inputs (no table of ticks in columns/)")
     log = run_folder.read_events(folder, [])

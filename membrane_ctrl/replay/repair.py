@@ -188,7 +188,7 @@ def _is_whole_object(data: bytes) -> bool:
 
 def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
     """Report only: a replay reads whatever is intact."""
-    reader = inputs_file.open_inputs(run_dir)
+    reader = inputs_file.InputsReader(run_dir)
     ticks = sum(len(frame.records) for frame in reader)
     name = f"inputs ({len(reader.paths)} files)"
     if reader.damage:
@@ -229,7 +229,7 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
             last_s = float(new[-1, telemetry.COLUMN["mono_s"]])
             summary.add_rows(new[np.isfinite(telemetry.column(new, "state"))])
     ticks = 0
-    for frame in inputs_file.open_inputs(run_dir):
+    for frame in inputs_file.InputsReader(run_dir):
         ticks += len(frame.records)
         for estimate in frame.estimates.values():
             summary.add_shape(estimate)

@@ -265,8 +265,6 @@ def export_command(
     run: Path, form: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
     """Write a run for other programs and report where."""
-    if end in FORMATS:
-        raise errors.InputError(f"--to {end}: --to is the end of the part; write --format {end}")
     opened = open_run(catalogue.resolve(run))
     folder = out.resolve() if out else opened.folder / "export"
     files = export(opened, form, folder, streams, *part_s(opened.origin_utc, start, end))

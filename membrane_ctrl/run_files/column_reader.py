@@ -14,7 +14,6 @@ import pyarrow as pa
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain, read_bytes
-from membrane_ctrl.model.telemetry import TODAY
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import column_codec, sealed_stream, tables
 from membrane_ctrl.run_files.column_file import FOLDER, SUFFIX
@@ -118,9 +117,9 @@ def _parts(
     path: Path, content: sealed_stream.Unsealed, names: Sequence[str] | None, notes: list[str], over: bool, cells: int
 ) -> Iterator[pa.Table]:
     schema = pa.ipc.open_stream(content.data).schema
-    known = {TODAY.get(name, name): name for name in schema.names if _is_ours(schema, name)}
-    wanted = [name for name in (known if names is None else names) if name in known]
-    absent = sorted(set(names or ()) - set(wanted) - tables.LATER_COLUMNS)
+    known = {name for name in schema.names if _is_ours(schema, name)}
+    wanted = [name for name in (schema.names if names is None else names) if name in known]
+    absent = sorted(set(names or ()) - set(wanted))
     if absent:
         add_note(notes, f"{path.name}: written by another version, without {', '.join(absent)}")
     if not wanted:
@@ -131,14 +130,14 @@ def _parts(
     rows = size_bytes = 0  # of what waits
     error: Exception | None = None
     try:
-        for batch in sealed_stream.decoded_batches(content.data, [known[name] for name in wanted]):
+        for batch in sealed_stream.decoded_batches(content.data, wanted):
             if batch.num_rows > _PART_CELLS // len(wanted) or any(column.null_count for column in batch.columns):
                 raise pa.ArrowInvalid("a batch that no recorder writes")
             rows, size_bytes = rows + batch.num_rows, size_bytes + batch.nbytes
             if waiting and (rows > rows_max or size_bytes > _PART_BYTES):
                 yield pa.Table.from_batches(waiting)
                 waiting, rows, size_bytes = [], batch.num_rows, batch.nbytes
-            waiting.append(batch.rename_columns(wanted))
+            waiting.append(batch)
             spans.append(_span(batch))
     except (pa.ArrowException, OSError, ValueError) as found:
         error = found

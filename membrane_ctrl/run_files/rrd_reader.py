@@ -71,17 +71,12 @@ def read_shapes(path: Path, notes: list[str]) -> dict[str, Column]:
         values[here] = rows[there, place]
         return values
 
-    sag_um = at(streams.SAG.path, 0)
-    if streams.SAG.path + _VARIANCES in found:
-        sigma_um, laser = np.sqrt(np.maximum(at(streams.SAG.path + _VARIANCES, 0), 0.0)), 1
-    else:  # earlier versions: sag, one sigma more, one less, laser
-        sigma_um, laser = at(streams.SAG.path, 1) - sag_um, 3
     return {
         "time_s": _seconds(clock_ns),
         "coeffs_um": coeffs_um,
-        "sag_um": sag_um,
-        "sag_sigma_um": sigma_um,
-        "displacement_um": at(streams.SAG.path, laser),
+        "sag_um": at(streams.SAG.path, 0),
+        "sag_sigma_um": np.sqrt(np.maximum(at(streams.SAG.path + _VARIANCES, 0), 0.0)),
+        "displacement_um": at(streams.SAG.path, 1),
         "slope_residual_urad": at(streams.RESIDUAL.path, 0),
         "valid_fraction": at(streams.QUALITY.path, 0),
         "saturated_fraction": at(streams.QUALITY.path, 1),

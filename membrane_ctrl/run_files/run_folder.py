@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, files, plain_json, run_events
-from membrane_ctrl.model.telemetry import TODAY
 from membrane_ctrl.run_files.column_file import FOLDER
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
@@ -175,13 +174,10 @@ def _user() -> str:
 
 
 _SUMMARY_SCHEMA = "membrane-summary/2"
-_SIGN_TURNED_SCHEMA = "membrane-summary/1"  # true centre minus target; it is now target minus true centre
 # Enough for a fault campaign of months; a line is about 150 bytes.
 EVENTS_BYTES_MAX = 64_000_000
 _RUN_MAX_S = 1e9  # thirty years
 _NAMED_MAX = 20
-# Of the estimate of the centre, learned since; the laser alone never used it.
-_RETIRED = (("estimator", "leak_walk_optics_um_per_s_per_root_s"),)
 
 
 def find_folder(path: Path) -> Path:
@@ -212,7 +208,6 @@ class LoggedEvent:
 
 def logged(line: events.EventLine) -> LoggedEvent:
     """What a line means; a mark made while the run went on (`ctl mark`) is recorded as a command."""
-    line = {TODAY.get(key, key): value for key, value in line.items()}
     event = run_events.from_dict(line)
     if isinstance(event, events.CommandTaken) and event.command == "mark":
         line = line | {"kind": "mark", "text": event.text or event.why}
@@ -240,7 +235,7 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     except (OSError, ValueError) as error:
         notes.append(f"summary.json: cannot be read ({error})")
         return None
-    if not isinstance(summary, dict) or summary.get("schema") not in (_SUMMARY_SCHEMA, _SIGN_TURNED_SCHEMA):
+    if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
         notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
         return {} if not isinstance(summary, dict) else summary
     if not plain_json.take_checksum(summary):
@@ -249,22 +244,12 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
     if not is_moment(summary.get("duration_s", 0.0) or 0.0):
         notes.append("summary.json: impossible duration_s; it is not used")
         del summary["duration_s"]
-    return _with_present_sign(summary)
-
-
-def _with_present_sign(summary: dict[str, Any]) -> dict[str, Any]:
-    """A summary of an earlier version, with its true errors in the sign of `error_um`."""
-    if summary["schema"] == _SIGN_TURNED_SCHEMA:
-        ends = summary.get("sag_error_um")
-        for table, keys in ((summary, ("true_bias_um",)), (ends if isinstance(ends, dict) else {}, ("start", "end"))):
-            table.update({key: -table[key] for key in keys if isinstance(table.get(key), (int, float))})
-        summary["schema"] = _SUMMARY_SCHEMA
     return summary
 
 
 def exact_config(folder: Path) -> Config:
     """`config.toml` as it was in force. Raises InputError if this version does not understand all of it."""
-    return toml_file.load(folder / "config.toml", Config, follow=False, retired=_RETIRED)
+    return toml_file.load(folder / "config.toml", Config, follow=False)
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
@@ -276,7 +261,6 @@ def read_config(folder: Path, notes: list[str]) -> Config:
     except errors.InputError as error:
         notes.append(f"{error}; all defaults are used")
         return Config()
-    toml_file.drop(tables, _RETIRED)
     try:
         return toml_file.parse(tables, Config, "config.toml")
     except errors.InputError as error:

@@ -112,8 +112,6 @@ RARE = "rare"
 GIVEN: dict[str, str] = {
     name: SAME.get(name, f"given_{name}" if name in telemetry.FIELDS else name) for name in RECORD.names or ()
 }
-# Columns that runs of earlier versions lack and need not have: 0 there, as of a bench without interlocks.
-LATER_COLUMNS = frozenset({GIVEN["interlock_inputs"], GIVEN["interlocks_open"], "interlocks_open"})
 # What a field of the row nearly always equals: the difference is stored. All others are single precision, finer than
 # their sensors (1 mm to 0.1 nm), at half the size and reading time.
 _SUMS = {

@@ -4,7 +4,7 @@ import json
 import math
 import re
 import types
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -58,9 +58,8 @@ def _built(kind: Any, data: Any) -> Any:
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return kind.model_validate(data)
     if is_dataclass(kind):
-        hints = get_type_hints(kind)  # a field with a default may be missing: earlier versions had none
-        given = [f for f in fields(kind) if f.name in data or f.default is MISSING]
-        return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in given})
+        hints = get_type_hints(kind)
+        return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
     value = kind(data)
     if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
         raise ValueError(f"{value:g} is not a plausible quantity")

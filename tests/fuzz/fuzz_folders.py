@@ -115,7 +115,7 @@ class Room:
 
     def make(self, kind: str) -> None:
         """A good folder of a kind, unless it is there."""
-        from good_folders import good_inputs, good_live, good_run, good_sets, good_sofast, good_track, good_tuning
+        from good_folders import good_live, good_run, good_sets, good_sofast, good_track, good_tuning
 
         folder = self._good / kind
         if kind == "live":
@@ -126,7 +126,6 @@ class Room:
             match kind:
                 case "logs":
                     good_run(folder)
-                    good_inputs(self._good / "inputs-000.bin")
                 case "sets":
                     good_sets(self._good)
                 case "track":
@@ -152,8 +151,6 @@ class Room:
         inside = place / "inside"
         self.make(one.command.reads)
         shutil.copytree(self._good / one.command.reads, inside)
-        if one.command.reads == "logs" and rng.random() < 0.3:  # with what an earlier version left
-            shutil.copy(self._good / "inputs-000.bin", inside / self._run_name)
         if one.command.reads == "sets":
             spoil(rng.choice((inside, inside / "0000", inside / "0001")), rng)
         elif one.command.reads != "logs":

@@ -16,8 +16,7 @@ from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import LAYOUT, Recording
 from membrane_ctrl.run_files.summary import Summary
-from tests.support.earlier_inputs import write_inputs
-from tests.support.virtual_record import CONFIG, batches_of, kept_ticks, memory_at, write_record
+from tests.support.virtual_record import CONFIG, kept_ticks, memory_at, write_record
 
 RUN = "20261121T010203Z-night"
 TUNING = "20261121T010203Z-session"
@@ -49,11 +48,6 @@ def good_run(logs: Path) -> Path:
     mark = {"mono_s": 1.0, "kind": "mark", "text": "door", "who": "me", "time_utc": "2026-11-21T01:02:04+00:00"}
     (folder / "annotations.jsonl").write_text(json.dumps(mark) + "\n")
     return folder
-
-
-def good_inputs(path: Path) -> None:
-    """What its ticks were given, in a file as an earlier version wrote it."""
-    write_inputs(path, batches_of(kept_ticks(_SECONDS)))
 
 
 def _write_segment(folder: Path, rows: object) -> None:

@@ -41,7 +41,6 @@ _OTHERS = (
 )
 _TIMES = ("2026-11-21", "9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00-12:00", "2026-11-21T01:02:03", "now")
 _SEAL = re.compile(rb"seal:([0-9a-f]{4})([0-9a-f]{8})([0-9a-f]{8})")
-_FRAME = struct.Struct("<8sII")
 
 Mutation = Callable[[Path, random.Random], None]
 
@@ -152,14 +151,7 @@ def swap(path: Path, rng: random.Random) -> None:
         path.write_bytes(theirs)
         other.write_bytes(ours)
         return
-    name = rng.choice(
-        (
-            f"inputs-{rng.randrange(999):03d}.bin",
-            f"ticks-{rng.randrange(999):03d}.arrows",
-            "x\x1b[31m.rrd",
-            "night-007.rrd",
-        )
-    )
+    name = rng.choice((f"ticks-{rng.randrange(999):03d}.arrows", "x\x1b[31m.rrd", "night-007.rrd"))
     shutil.copy(path, path.parent / name)
 
 
@@ -262,37 +254,6 @@ def sealed_again(content: bytes) -> bytes:
     return bytes(data)
 
 
-def reframed(path: Path, rng: random.Random) -> None:
-    """What is in a frame of inputs is other, and its checksum is right again."""
-    data = path.read_bytes()
-    place = data.find(b"MBRNin01")
-    if place < 0:
-        return
-    _, length, _ = _FRAME.unpack_from(data, place)
-    body = bytearray(zlib.decompress(data[place + _FRAME.size : place + _FRAME.size + length]))
-    for _ in range(rng.choice((1, 2, 10))):
-        body[_place(body, rng)] = rng.choice((0, 0x7F, 0xFF, rng.randrange(256)))
-    if rng.random() < 0.2:
-        struct.pack_into("<I", body, 0, rng.choice((2**32 - 1, 2**20, 0, 1, 49, 51)))
-    if rng.random() < 0.1:
-        body += bytes(rng.choice((10, 10**6, 2 * 10**7)))
-    packed = zlib.compress(bytes(body), 1)
-    head = _FRAME.pack(b"MBRNin01", len(packed), zlib.crc32(packed))
-    path.write_bytes(data[:place] + head + packed + data[place + _FRAME.size + length :])
-
-
-def reheaded(path: Path, rng: random.Random) -> None:
-    """The first line of the inputs names other fields."""
-    line, _, rest = path.read_bytes().partition(b"\n")
-    head = json.loads(line)
-    kind = rng.choice(("<f8", "|O", "1000000000f8", "<U9", "<i4", "V8", "x", "<M8[s]", 7, None))
-    if rng.random() < 0.7:
-        rng.choice(head["fields"])[1] = kind
-    else:
-        _change(head, rng)
-    path.write_bytes(json.dumps(head).encode() + b"\n" + rest)
-
-
 def picture(path: Path, rng: random.Random) -> None:
     """A PNG says another size in its head, and its checksum is right."""
     data = bytearray(path.read_bytes())
@@ -311,7 +272,6 @@ _OF: dict[str, tuple[Mutation, ...]] = {
     ".jsonl": (table,) * 6,
     ".toml": (toml,) * 6,
     ".arrows": (resealed,) * 6,
-    ".bin": (reframed, reframed, reframed, reheaded),
     ".png": (picture,) * 3,
     ".rrd": (numbers, flip),
 }

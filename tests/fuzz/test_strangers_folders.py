@@ -21,21 +21,19 @@ import pyarrow as pa
 import pytest
 import tomli_w
 from fuzz_folders import Case, Room, case
-from good_folders import RUN, good_inputs, good_run, good_sets
+from good_folders import RUN, good_run, good_sets
 from mutations import sealed_again
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.controller.tick import RECORD
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.run_files import run_folder
-from membrane_ctrl.run_files.inputs_file import decode_columns, open_inputs
+from membrane_ctrl.run_files.column_file import PROGRAM
 from membrane_ctrl.run_files.sealed_stream import SealedStream, require_bounded, unseal
 from membrane_ctrl.run_files.segments import panics_are_faults, whole_messages
 from membrane_ctrl.run_files.tables import tick_schema
 from tests.support.peak_memory import peak_mb, reset_peak
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
-FRAME = struct.Struct("<8sII")
 Said = pytest.CaptureFixture[str]
 
 
@@ -43,7 +41,6 @@ Said = pytest.CaptureFixture[str]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("good")
     good_run(root / "logs")
-    good_inputs(root / "inputs-000.bin")
     good_sets(root)
     return root
 
@@ -52,13 +49,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(made: Path, tmp_path: Path) -> Path:
     shutil.copytree(made / "logs", tmp_path / "logs")
     return tmp_path / "logs" / RUN
-
-
-@pytest.fixture
-def earlier(folder: Path, made: Path) -> Path:
-    """A run with its inputs as an earlier version left them."""
-    shutil.copy(made / "inputs-000.bin", folder)
-    return folder
 
 
 @pytest.fixture
@@ -176,14 +166,6 @@ def test_what_is_no_plain_file_is_noted_and_not_waited_for(
     assert "secret" not in out.replace(str(secret), "")
 
 
-def test_inputs_that_are_a_pipe_are_one_line(earlier: Path, capsys: Said) -> None:
-    (earlier / "inputs-000.bin").unlink()
-    os.mkfifo(earlier / "inputs-000.bin")
-    assert "inputs-000.bin: cannot be read (not a plain file (a pipe or a device))" in refused(
-        capsys, "replay", str(earlier)
-    )
-
-
 # ---------------------------------------------------------------------------------------------------------- bounds
 
 
@@ -258,55 +240,6 @@ def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None
         stream.close()
     assert run(["runs", "show", str(folder)]) == 0
     assert "without mono_s" in capsys.readouterr().out
-
-
-def frame(body: bytes) -> bytes:
-    packed = zlib.compress(body)
-    return FRAME.pack(b"MBRNin01", len(packed), zlib.crc32(packed)) + packed
-
-
-def test_a_second_of_inputs_that_would_be_four_gigabytes(earlier: Path, capsys: Said) -> None:
-    path = earlier / "inputs-000.bin"
-    head = path.read_bytes().partition(b"\n")[0] + b"\n"
-    bomb = zlib.compressobj(9)
-    packed = b"".join(bomb.compress(bytes(10**7)) for _ in range(40)) + bomb.flush()
-    path.write_bytes(head + FRAME.pack(b"MBRNin01", len(packed), zlib.crc32(packed)) + packed)
-    before_mb = reset_peak()
-    assert "no tick to replay" in refused(capsys, "replay", str(earlier))
-    assert peak_mb() - before_mb < 200
-
-
-@pytest.mark.parametrize("count", [2**32 - 1, 2**20, 51])
-def test_a_count_of_ticks_that_are_not_there(earlier: Path, count: int, capsys: Said) -> None:
-    path = earlier / "inputs-000.bin"
-    head = path.read_bytes().partition(b"\n")[0] + b"\n"
-    path.write_bytes(head + frame(struct.pack("<I", count) + bytes(4000)))
-    assert f"{count} ticks cannot be in 4000 bytes" in refused(capsys, "replay", str(earlier))
-    with pytest.raises(ValueError, match="ticks cannot be in"):
-        decode_columns(bytes(100), RECORD, 324 * 2**30)
-
-
-@pytest.mark.parametrize("code", ["|O", "1000000000f8", "<U9"])
-def test_fields_of_another_kind_are_not_believed(earlier: Path, code: str) -> None:
-    path = earlier / "inputs-000.bin"
-    ticks = sum(len(found.records) for found in open_inputs(earlier))
-    line, _, rest = path.read_bytes().partition(b"\n")
-    head = json.loads(line)
-    head["fields"][1][1] = code
-    path.write_bytes(json.dumps(head).encode() + b"\n" + rest)
-    reader = open_inputs(earlier)
-    assert sum(len(found.records) for found in reader) == ticks > 100  # taken for a file of this program, which it is
-    assert reader.damage == ["inputs-000.bin: its first line is damaged; assuming this version's format"]
-
-
-def test_magics_over_magics_are_given_up(earlier: Path) -> None:
-    """Each says that the rest of the file is its frame: summing all of them up would take a day."""
-    path = earlier / "inputs-000.bin"
-    head = path.read_bytes().partition(b"\n")[0] + b"\n"
-    path.write_bytes(head + FRAME.pack(b"MBRNin01", 2_000_000, 0) * 250_000)
-    reader = open_inputs(earlier)
-    assert not list(reader)
-    assert len(reader.damage) == 1
 
 
 def test_a_segment_of_a_terabyte_of_nothing(folder: Path, capsys: Said) -> None:
@@ -476,21 +409,21 @@ def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Said) -> Non
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_no_control_byte_of_a_run_is_printed(earlier: Path, capsys: Said) -> None:
-    events = [json.loads(line) for line in (earlier / "events.jsonl").read_text().splitlines()]
+def test_no_control_byte_of_a_run_is_printed(folder: Path, capsys: Said) -> None:
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     for event in events:
         event.pop("crc32", None)
         event.update({key: HOSTILE for key in ("name", "text", "exit") if key in event})
     events.append({"kind": "mark", "mono_s": 1.0, "text": HOSTILE})
     events.append({"kind": "fault", "mono_s": 1.5, "name": HOSTILE})
-    (earlier / "events.jsonl").write_text("".join(f"{dumps_checked(event)}\n" for event in events))
-    summary = json.loads((earlier / "summary.json").read_text())
+    (folder / "events.jsonl").write_text("".join(f"{dumps_checked(event)}\n" for event in events))
+    summary = json.loads((folder / "summary.json").read_text())
     summary.pop("crc32")
-    (earlier / "summary.json").write_text(dumps_checked({**summary, "exit": HOSTILE}))
-    line, _, rest = (earlier / "inputs-000.bin").read_bytes().partition(b"\n")
-    head = json.dumps(json.loads(line) | {"program": HOSTILE}).encode()
-    (earlier / "inputs-000.bin").write_bytes(head + b"\n" + rest)
-    folder = earlier.rename(earlier.with_name(f"{RUN}-\x1b[31m"))
+    (folder / "summary.json").write_text(dumps_checked({**summary, "exit": HOSTILE}))
+    ticks = folder / "columns" / "ticks-000.arrows"
+    program = PROGRAM.encode()
+    ticks.write_bytes(sealed_again(ticks.read_bytes().replace(program, HOSTILE.encode()[: len(program)])))
+    folder = folder.rename(folder.with_name(f"{RUN}-\x1b[31m"))
     for words in (
         ("runs", "--logs", str(folder.parent)),
         ("runs", "--logs", str(folder.parent), "--json"),

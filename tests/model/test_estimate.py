@@ -63,8 +63,6 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
         LINE + b" " * 10_000 + b"\n" + ARRAYS,
         with_head(terms=1_000_000_000),
         with_head(terms=-36),
-        with_head(symmetric=1),
-        with_head(single=True, symmetric=None),
         with_head(covariance_um2=[1.0]),
         with_head(__class__="x"),
         with_head(sag_um="37000"),
@@ -82,17 +80,11 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
         LINE + b"\n" + np.full(36, np.inf).tobytes() + ARRAYS[288:],
         LINE + b"\n" + ARRAYS[:288] + np.full((len(ARRAYS) - 288) // 4, np.inf, "<f4").tobytes(),
     ],
-    ids=range(28),
+    ids=range(26),
 )
 def test_what_is_no_estimate_is_refused(message: bytes) -> None:
     with pytest.raises(ValueError):  # JSON's own words are as good as ours
         unpack_estimate(message)
-
-
-def test_what_an_earlier_version_did_not_send_is_nan() -> None:
-    head = json.loads(LINE)
-    del head["geometry_sag_sigma_um"]
-    assert math.isnan(unpack_estimate(json.dumps(head).encode() + b"\n" + ARRAYS).geometry_sag_sigma_um)
 
 
 def test_random_damage_is_refused_or_gives_an_estimate_of_the_right_kinds() -> None:

@@ -25,7 +25,7 @@ from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
 from membrane_ctrl.recorder.sink import Recording, RecordingError
 from membrane_ctrl.run_files.column_file import Journal
-from membrane_ctrl.run_files.inputs_file import open_inputs
+from membrane_ctrl.run_files.inputs_file import InputsReader
 from membrane_ctrl.run_files.run_folder import write_config
 from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
 from tests.support.rrd_reading import scalars
@@ -284,7 +284,7 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
     if room_again:
         seconds(7, 2)
         bench.recorder.finish(in_haste=True)
-    found = [int(tick) for frame in open_inputs(bench.run_dir) for tick in frame.records["tick"]]
+    found = [int(tick) for frame in InputsReader(bench.run_dir) for tick in frame.records["tick"]]
     account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
     assert found == list(range(1, 450 if room_again else 150))  # what the journal had before
     assert account["input_ticks_lost"] == (0 if room_again else 200)

@@ -73,7 +73,7 @@ def test_the_page_states_the_figures_of_the_summary(night: Path, tmp_path: Path)
         set_summary(night, **changes)
         return str(reviewed([night], tmp_path / "r.rrd")["/summary"]["TextDocument:text"][0][0])
 
-    assert "earlier version" in page(**FIGURES, held={"std_um": "much"})
+    assert "missing or damaged" in page(**FIGURES, held={"std_um": "much"})
     rows = dict(line.strip("| ").split(" | ") for line in page(held=HELD).splitlines() if line.count(" | ") == 1)
     assert rows["std of 1 s means, true centre"] == "0.123 µm"
     assert rows["1 s means within ±2 µm"] == "98 %"

@@ -184,18 +184,6 @@ def test_another_schema_is_said(tmp_path: Path) -> None:
     assert any("membrane-summary/2" in note for note in open_run(folder).notes)
 
 
-@pytest.mark.parametrize("ends", [{"start": -0.3, "end": None}, None, "?"])
-def test_true_errors_of_an_earlier_summary_get_the_present_sign(tmp_path: Path, ends: object) -> None:
-    folder = written(tmp_path, 0.02)
-    set_summary(folder, schema="membrane-summary/1", true_bias_um=0.168, sag_error_um=ends, true_std_um=0.2)
-    summary = open_run(folder).summary
-    assert summary is not None
-    assert (summary["true_bias_um"], summary["true_std_um"]) == (-0.168, 0.2)
-    assert summary["sag_error_um"] == ({"start": 0.3, "end": None} if isinstance(ends, dict) else ends)
-    set_summary(folder, schema="membrane-summary/1", true_bias_um=None)
-    assert open_run(folder).notes == []
-
-
 @pytest.mark.parametrize("what", ["absent", "empty", "file"])
 def test_what_is_no_run_is_refused(tmp_path: Path, what: str) -> None:
     path = tmp_path / what

@@ -146,19 +146,6 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
     assert read["sag_sigma_um"] == pytest.approx(4 * [0.1])
 
 
-def test_the_sag_of_earlier_versions_is_read(tmp_path: Path) -> None:
-    recording = Recording(tmp_path, "test", RunClock.start(), Config())
-    recording.next_segment()
-    at_s = np.array([1.0, 2.0])
-    recording.scalars("/shape/zernike", at_s, np.zeros((2, 36)))
-    recording.scalars("/shape/sag_change", at_s, np.array([[1.0, 1.2, 0.8, 5.0], [2.0, 2.3, 1.7, 6.0]]))
-    recording.close()
-    read = read_shapes(tmp_path / "test-000.rrd", [])
-    assert read["sag_um"] == pytest.approx([1.0, 2.0])
-    assert read["sag_sigma_um"] == pytest.approx([0.2, 0.3])
-    assert read["displacement_um"] == pytest.approx([5.0, 6.0])
-
-
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
 def test_thumbnails_come_at_their_interval(tmp_path: Path, dtype: str) -> None:
     ring = FrameRing(4, 512, 600, dtype)

@@ -38,7 +38,7 @@ def read_incident(folder: Path) -> Incident:
 
 def check_incident(incident: Incident) -> list[str]:
     """Replay an incident; where today's decisions are not the expected ones, as sentences."""
-    inputs = inputs_file.open_inputs(incident.folder)
+    inputs = inputs_file.InputsReader(incident.folder)
     config = config_file.load(incident.folder / "config.toml", Config)
     begin = next((int(frame.records["tick"][0]) for frame in inputs if len(frame.records)), 1)
     try:

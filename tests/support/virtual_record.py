@@ -23,7 +23,6 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files.tables import ColumnTables
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.earlier_inputs import write_inputs
 from tests.support.synthetic_shape import shape_at
 
 CONFIG = Config(twin=TwinConfig(laser_noise_um=0.5))
@@ -123,12 +122,6 @@ def write_record(
     """The run's folder: configuration, tables, events; ticks of `lost` are not in it."""
     write_head(folder, ticks)
     write_tables(folder, batches_of(ticks, lost, memories))
-
-
-def write_earlier_record(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:
-    """The folder of a run of version 0.1, with its inputs in a file of frames."""
-    write_head(folder, ticks)
-    write_inputs(folder / "inputs-000.bin", batches_of(ticks))
 
 
 def write_head(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:

@@ -141,8 +141,7 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
     """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains it."""
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
-    # a loop that waits has no estimate of the leak; in runs of earlier versions it repeats its error
-    paused = np.isnan(level["mean_leak_um_per_s"]) | (np.diff(error_um, prepend=np.nan) == 0)
+    paused = np.isnan(level["mean_leak_um_per_s"])  # a loop that waits has no estimate of the leak
     setpoint_um = error_um + level["mean_displacement_um"]
     ramped = np.abs(differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
     out &= ~widened((level["fault"] > 0) | paused | ramped, BACK_S)

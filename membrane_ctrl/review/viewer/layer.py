@@ -302,7 +302,7 @@ def _summary_page(run: Run) -> str:
     try:
         page = summary_page(run.summary or {}, status, run.config)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
-        page = "`summary.json` is missing, damaged or of an earlier version.\n"
+        page = "`summary.json` is missing or damaged.\n"
     name = events.for_people(run.name)
     return f"**{name}**\n\n{page}\nIntervals and spectra: `membrane-ctrl report {name}`\n"
 
