@@ -185,7 +185,7 @@ def differing_fields(
 ) -> dict[str, tuple[float, float]]:
     """Fields that are not bit-identical: recorded and today's value."""
     fields: dict[str, tuple[float, float]] = {}
-    for name in telemetry.TelemetryRow.__slots__:
+    for name in telemetry.FIELDS:
         then, now = getattr(recorded, name), getattr(today, name)
         if then != now and not (math.isnan(then) and math.isnan(now)):
             fields[name] = (float(then), float(now))
