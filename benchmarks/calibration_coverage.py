@@ -45,6 +45,7 @@ from membrane_ctrl.metrology.calibrate.solve import Solution, fit_on, solve
 from membrane_ctrl.metrology.checked import Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.optics.surface import Artefact, Surface
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from membrane_ctrl.sim.optics.simulation_spec import leaning
@@ -133,7 +134,7 @@ class DrawnBench:
         """What the camera sees in the sphere, which leans and is not quite as stated."""
         rng, radius_mm = np.random.default_rng(seed), SPHERE.radius_mm
         curvature_mm = 1 / (SPHERE.curvature_per_mm + SPHERE.curvature_sigma_per_mm * rng.standard_normal())
-        form_um = 1e3 * SPHERE.form_sigma_mm * rng.standard_normal(36)
+        form_um = 1e3 * SPHERE.form_sigma_mm * rng.standard_normal(ZERNIKE_TERMS)
         shape = leaning(curvature_mm, radius_mm, *rng.uniform(-2e-3, 2e-3, 2), form_um)
         mirror = self.stated.mirror.model_copy(
             update={"radius_mm": radius_mm, "analysis_radius_mm": 0.95 * radius_mm}

@@ -22,6 +22,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.controller.tick import RECORD, TICK, TickBatch
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows, ShapeState, State
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.tables import GIVEN, ColumnTables
 
 RATE_HZ = 10.0
@@ -221,13 +222,13 @@ def _shapes(
     rng: np.random.Generator, time_s: NDArray[np.float64], rows: Rows, events: list[Planted]
 ) -> Iterator[ShapeEstimate]:
     """A figure with 20 nm of noise a term, an astigmatism that creeps, and jumps in it."""
-    covariance = np.diag(np.full(36, 0.02**2))
+    covariance = np.diag(np.full(ZERNIKE_TERMS, 0.02**2))
     jumps = [(event.time_s, event.size) for event in events if event.kind == JUMP]
     every = round(SHAPE_PERIOD_S * RATE_HZ)
     true_um = rows[:, COLUMN["truth_displacement_um"]]
     for k in range(every // 2, time_s.size, every):
         now_s = float(time_s[k])
-        coeffs = 0.02 * rng.normal(size=36)
+        coeffs = 0.02 * rng.normal(size=ZERNIKE_TERMS)
         sag = 37_100.0 + true_um[k] + 0.05 * rng.normal()
         coeffs[[0, 3]] += sag / 2, sag / (2 * np.sqrt(3))
         coeffs[4] += 900 + 0.02 * now_s / 3600

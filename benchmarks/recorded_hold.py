@@ -14,6 +14,7 @@ from membrane_ctrl.controller.tick import pack_tick
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes.ring import RingWriter
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -51,7 +52,7 @@ class RealisticShapes:
         self._truth = TruthShape(bench, config, seed=1)
         self._track = config.shape.mode == "track"
         self._rng = np.random.default_rng(1)
-        mixed = self._rng.normal(size=(36, 36)) * 1e-3
+        mixed = self._rng.normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS)) * 1e-3
         self._covariance_um2 = self._kept_um2 = mixed @ mixed.T
 
     def __call__(self, now_s: float) -> ShapeEstimate | None:
@@ -59,7 +60,7 @@ class RealisticShapes:
         estimate = self._truth(now_s)
         if estimate is None:
             return None
-        noisy = estimate.coeffs_um + (FRAME_UM if self._track else 1e-3) * self._rng.normal(size=36)
+        noisy = estimate.coeffs_um + (FRAME_UM if self._track else 1e-3) * self._rng.normal(size=ZERNIKE_TERMS)
         if not self._track or estimate.cycle % _COVARIANCE_EVERY == 1:
             self._kept_um2 = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
         found = replace(estimate, coeffs_um=noisy, covariance_um2=self._kept_um2)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 FloatArray = NDArray[np.float64]
 ITERATIONS = 5
@@ -28,7 +29,7 @@ def wrapped_phases(frames: list[NDArray[np.uint8]]) -> FloatArray:
 
 
 def design(x: FloatArray, y: FloatArray, radius_mm: float) -> FloatArray:
-    """Derivatives of Noll 2..36 at some points, (2 n, 35), and with them the paper's matrix D."""
+    """Derivatives of all terms but piston at some points, (2 n, terms - 1): the paper's matrix D."""
     rho_x, rho_y = zernike.gradients(x / radius_mm, y / radius_mm)
     return np.concatenate([rho_x[1:], rho_y[1:]], axis=1).T / radius_mm
 
@@ -36,8 +37,8 @@ def design(x: FloatArray, y: FloatArray, radius_mm: float) -> FloatArray:
 def reconstruct(
     geometry: Geometry, rays: FloatArray, screen_mm: FloatArray, radius_mm: float, start_sag_mm: float = 40.0
 ) -> FloatArray:
-    """Coefficients (36,) in mm from rays (3, n) and screen points (2, n) of every pixel."""
-    coeffs = np.zeros(36)
+    """Coefficients (terms,) in mm from rays (3, n) and screen points (2, n) of every pixel."""
+    coeffs = np.zeros(ZERNIKE_TERMS)
     target = geometry.screen_points(screen_mm)
     pinhole = geometry.pinhole_mm[:, None]
     t = -geometry.pinhole_mm[2] / rays[2]
@@ -54,7 +55,8 @@ def reconstruct(
 
 
 def _least_squares(x: FloatArray, y: FloatArray, gx: FloatArray, gy: FloatArray, radius_mm: float) -> FloatArray:
-    matrix, right = np.zeros((35, 35)), np.zeros(35)
+    slopes = ZERNIKE_TERMS - 1  # piston has none
+    matrix, right = np.zeros((slopes, slopes)), np.zeros(slopes)
     for first in range(0, x.size, _CHUNK):
         part = slice(first, first + _CHUNK)
         d = design(x[part], y[part], radius_mm)

@@ -16,10 +16,11 @@ from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.shape_loop import ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.plant import Plant
 
 # Of a paraboloid with a little of the Hencky bowl's spherical terms (Noll 4, 11, 22); piston follows the vertex.
-SENSITIVITY = np.zeros(36)
+SENSITIVITY = np.zeros(ZERNIKE_TERMS)
 SENSITIVITY[[0, 3, 10, 21]] = 0.5, 0.2887, -0.012, 0.001
 
 EXPOSURES_S = 0.8  # 8 frames
@@ -43,13 +44,13 @@ class Tracked:
 def estimate_of(
     time_s: float, sag_change_um: float, displacement_um: float, noise_um: NDArray[np.float64]
 ) -> ShapeEstimate:
-    """A shape estimate of a mirror whose sag has changed; `noise_um` (36,) is added to the coefficients."""
+    """A shape estimate of a mirror whose sag has changed; `noise_um` (terms,) is added to the coefficients."""
     return ShapeEstimate(
         time_s=time_s,
         kind="fringes",
         coeffs_um=SENSITIVITY * sag_change_um + noise_um,
         hencky_um=37_100.0,
-        covariance_um2=1e-6 * np.eye(36),
+        covariance_um2=1e-6 * np.eye(ZERNIKE_TERMS),
         sag_um=37_100.0 + sag_change_um,
         sag_sigma_um=0.01,
         displacement_um=displacement_um,
@@ -81,7 +82,7 @@ class EstimateMaker:
         sag_um, mean_laser_um = np.mean(self._seen, axis=0)
         middle_s = self._begin_s + EXPOSURES_S / 2
         self._seen, self._begin_s = [], now_s
-        noise_um = self._coefficient_noise_um * self._rng.standard_normal(36)
+        noise_um = self._coefficient_noise_um * self._rng.standard_normal(ZERNIKE_TERMS)
         return estimate_of(middle_s, float(sag_um), float(mean_laser_um), noise_um)
 
 

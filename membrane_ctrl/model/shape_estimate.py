@@ -112,7 +112,7 @@ def _require_valid(head: Any) -> None:
         raise ValueError("shape estimate: missing or unknown fields in the first line")
     terms = head.pop("terms")
     if terms != ZERNIKE_TERMS:
-        raise ValueError(f"shape estimate of {str(terms)[:8]} Zernike terms; this program has {ZERNIKE_TERMS}")
+        raise ValueError(f"shape estimate of {str(terms)[:12]} Zernike terms; this program has {ZERNIKE_TERMS}")
     for name in NUMBERS:
         value = head[name]
         if type(value) not in (float, int) or abs(value) > _LARGEST:

@@ -4,19 +4,27 @@
 messages carry the number with which they were written, and those of another number are refused.
 """
 
-import math
-
 # The published method's number: every term of radial order 7 or less, in Noll's order, orthonormal over the whole
 # mirror. They cover what clamping by hand does to a film; shorter errors (ripple, wrinkles) are in the zonal map. The
 # time of a fit grows with the square of the number, that of its solution with the cube.
 ZERNIKE_TERMS = 36
 
-ZERNIKE_DEGREE = (math.isqrt(8 * ZERNIKE_TERMS + 1) - 3) // 2  # highest radial order
-_SUPPORTED_DEGREES = range(5, 11)  # 21 to 66 terms; tests/campaign/price_of_change covers both ends
-_SUPPORTED_TERMS = [(degree + 1) * (degree + 2) // 2 for degree in _SUPPORTED_DEGREES]
-if ZERNIKE_TERMS not in _SUPPORTED_TERMS:  # fits evaluate complete polynomials of `ZERNIKE_DEGREE`
-    raise ValueError(f"ZERNIKE_TERMS is {ZERNIKE_TERMS}, but only complete orders are supported: {_SUPPORTED_TERMS}")
+_SUPPORTED_DEGREES = range(5, 11)  # 21 to 66 terms; a campaign test sets both ends
 
+
+def degree_of(terms: int) -> int:
+    """Return the radial order up to which a number of terms is complete.
+
+    The fits evaluate complete polynomials of this degree. Raises ValueError for any other number.
+    """
+    complete = {(degree + 1) * (degree + 2) // 2: degree for degree in _SUPPORTED_DEGREES}
+    if terms not in complete:
+        numbers = ", ".join(str(number) for number in complete)
+        raise ValueError(f"{terms} Zernike terms end within a radial order or are not supported; possible: {numbers}")
+    return complete[terms]
+
+
+ZERNIKE_DEGREE = degree_of(ZERNIKE_TERMS)
 NOLL_INDICES = range(1, ZERNIKE_TERMS + 1)
 FIRST_FIGURE_INDEX = 4  # Noll 1 to 3 are piston and tilts
 COVARIANCE_UPPER_SIZE = ZERNIKE_TERMS * (ZERNIKE_TERMS + 1) // 2  # numbers in the upper half of a covariance

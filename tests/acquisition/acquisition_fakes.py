@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 HEIGHT_PX, WIDTH_PX = 4, 6
 FRINGES = [Pattern("sin", axis, k) for axis in "xy" for k in range(4)]
@@ -140,9 +141,9 @@ def estimate(
     return ShapeEstimate(
         time_s=time_s,
         kind=kind,
-        coeffs_um=np.zeros(36),
+        coeffs_um=np.zeros(ZERNIKE_TERMS),
         hencky_um=0.0,
-        covariance_um2=np.eye(36),
+        covariance_um2=np.eye(ZERNIKE_TERMS),
         sag_um=sag_um,
         sag_sigma_um=0.01,
         displacement_um=0.0,

@@ -14,6 +14,7 @@ from membrane_ctrl.metrology.calibrate.verdict import CYCLES, ring_um
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 OPTICS = OpticsConfig()
 CYCLE = ShapeEstimate(
@@ -21,7 +22,7 @@ CYCLE = ShapeEstimate(
     kind="fringes",
     coeffs_um=37_100.0 * zernike_projection(),
     hencky_um=0.0,
-    covariance_um2=np.zeros((36, 36)),
+    covariance_um2=np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS)),
     sag_um=37_100.0,
     sag_sigma_um=0.1,
     displacement_um=0.0,

@@ -12,6 +12,7 @@ import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
 from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, ShapeState, State, TelemetryRow
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RATE_HZ = 50.0
 NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))
@@ -76,9 +77,9 @@ def shape(
     return ShapeEstimate(
         time_s=time_s,
         kind="full" if cycle == 1 else "fringes",
-        coeffs_um=np.zeros(36),
+        coeffs_um=np.zeros(ZERNIKE_TERMS),
         hencky_um=0.0,
-        covariance_um2=np.eye(36),
+        covariance_um2=np.eye(ZERNIKE_TERMS),
         sag_um=sag_um,
         sag_sigma_um=0.012,
         displacement_um=0.0,

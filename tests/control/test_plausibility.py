@@ -10,6 +10,7 @@ import pytest
 
 from membrane_ctrl.control.film import Liar, PlausibilityCheck
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
@@ -17,9 +18,9 @@ Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change
 
 
 def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
-    nothing = np.zeros(36)
+    nothing = np.zeros(ZERNIKE_TERMS)
     return ShapeEstimate(
-        time_s, "fringes", nothing, 0.0, np.eye(36), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, verdict  # type: ignore[arg-type]
+        time_s, "fringes", nothing, 0.0, np.eye(ZERNIKE_TERMS), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, verdict  # type: ignore[arg-type]
     )  # fmt: skip
 
 

@@ -14,10 +14,11 @@ from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.shape_loop import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES, ShapeLoop, ShapeOutput
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 CONFIG = ShapeConfig(time_constant_s=60.0)
 PERIOD_S, DT_S = 2.0, 0.1
-QUIET = np.zeros(36)
+QUIET = np.zeros(ZERNIKE_TERMS)
 
 
 class Bench:
@@ -119,8 +120,8 @@ def test_trim_is_bounded_in_range_and_says_so() -> None:
     [
         ({"verdict": "rejected", "reason": "tracking lost"}, "tracking lost"),
         ({"displacement_um": math.nan}, "no laser reading"),
-        ({"coeffs_um": np.full(36, math.nan)}, "not finite"),
-        ({"covariance_um2": np.full((36, 36), math.inf)}, "not finite"),
+        ({"coeffs_um": np.full(ZERNIKE_TERMS, math.nan)}, "not finite"),
+        ({"covariance_um2": np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), math.inf)}, "not finite"),
         ({"time_s": 1.0}, "younger"),
         ({"displacement_um": 40.0}, "moved"),
         ({"coeffs_um": SENSITIVITY * 11.0}, "disagree"),

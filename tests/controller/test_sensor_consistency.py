@@ -13,6 +13,7 @@ from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 SAG_UM = 37_100.0
 
@@ -56,10 +57,10 @@ class Seconds:
             self.events += self.consistency.ask(inputs, state, 1.0, held)
 
     def _shape(self) -> ShapeEstimate:
-        nothing = np.zeros(36)
+        nothing = np.zeros(ZERNIKE_TERMS)
         sag_um = SAG_UM if self.camera_stuck else SAG_UM + 0.001 * (self.now_s % 7)
         return ShapeEstimate(
-            self.now_s, "fringes", nothing, 0.0, np.eye(36), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, "ok"
+            self.now_s, "fringes", nothing, 0.0, np.eye(ZERNIKE_TERMS), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, "ok"
         )  # fmt: skip
 
 

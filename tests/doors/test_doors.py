@@ -24,6 +24,7 @@ from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
 from tests.control_port.port_run import port_run
 
@@ -54,8 +55,10 @@ def seen_hold(**row: float | None) -> HoldSeen:
 
 
 def figure(**changed: object) -> ShapeEstimate:
-    coeffs_um = np.arange(1.0, 37.0)
-    made = ShapeEstimate(97.5, "full", coeffs_um, 0.0, np.eye(36), 500.0, 0.1, 0.0, 1.0, 1.0, 80.0, 0.0, "ok")
+    coeffs_um = np.arange(1.0, ZERNIKE_TERMS + 1.0)
+    made = ShapeEstimate(
+        97.5, "full", coeffs_um, 0.0, np.eye(ZERNIKE_TERMS), 500.0, 0.1, 0.0, 1.0, 1.0, 80.0, 0.0, "ok"
+    )
     return dataclasses.replace(made, **changed)  # type: ignore[arg-type]
 
 

@@ -13,6 +13,7 @@ from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.plain_json import dumps_checked, with_comment
 from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import LAYOUT, Recording
 from membrane_ctrl.run_files.summary import Summary
@@ -91,7 +92,7 @@ def good_track(folder: Path) -> None:
     assert run(["simulate", str(folder), "--shrink", "12", "--track", "6"]) == 0
     for extra in folder.glob("*/truth.*"):
         extra.unlink()
-    figures_um = 1e-3 * np.random.default_rng(1).normal(size=(600, 36))
+    figures_um = 1e-3 * np.random.default_rng(1).normal(size=(600, ZERNIKE_TERMS))
     np.savez(folder / "track.npz", time_s=np.arange(600) / 20, coeffs_um=figures_um)
 
 

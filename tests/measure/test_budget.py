@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence
@@ -185,7 +186,7 @@ def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:
 def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
     """Two sets show the same slopes, each with its noise: nothing of their row is left in the change between them."""
     rng = np.random.default_rng(1)
-    shown = 1e-4 * rng.standard_normal((36, 400))
+    shown = 1e-4 * rng.standard_normal((ZERNIKE_TERMS, 400))
 
     def row(noise_mm: float, grown: float) -> Source:
         effects = grown * shown + noise_mm * rng.standard_normal(shown.shape)

@@ -15,13 +15,14 @@ from prysm import io as prysm_io
 from prysm.polynomials import noll_to_nm, zernike_nm
 
 from membrane_ctrl.cli import run
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 
 X, Y = np.linspace(-300, 300, 61), np.linspace(-200, 250, 46)
 GX, GY = np.meshgrid(X, Y)
 BOWL = (GX**2 + GY**2) / 7000 + 2e-3 * GX - 1e-3 * GY + 0.4
 DENT = -0.003 * np.exp(-((GX - 150) ** 2 + (GY - 100) ** 2) / 800)  # to the right of the middle, and above it
 HEIGHT = np.where(np.hypot(GX, GY) < 290, BOWL + DENT, np.nan)
-COEFFS = [float(j) for j in range(36)]
+COEFFS = [float(j) for j in range(ZERNIKE_TERMS)]
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_fringe_terms_are_fitted_to_the_map(result: Path) -> None:
     exported(result, "zygo-xyz", "--zernike", "noll")
     table = json.loads((result / "figure.xyz.zernike.json").read_text())
     assert (table["coeffs_um"], table["radius_mm"]) == (COEFFS, 500.0)
-    assert [tuple(order) for order in table["n_m"]] == [tuple(noll_to_nm(j)) for j in range(1, 37)]
+    assert [tuple(order) for order in table["n_m"]] == [tuple(noll_to_nm(j)) for j in NOLL_INDICES]
 
 
 def harmful_header() -> bytes:

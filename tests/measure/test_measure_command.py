@@ -17,6 +17,7 @@ import tomli_w
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.optics import SigmasConfig
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 SMALL = ["--shrink", "8"]
 
@@ -57,7 +58,7 @@ def test_a_full_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert result["zernike"] | {"coeffs_um": None} == {
         "index": "noll", "first": 1, "normalisation": "rms", "radius_mm": 500.0, "coeffs_um": None,
     }  # fmt: skip
-    assert len(result["zernike"]["coeffs_um"]) == 36
+    assert len(result["zernike"]["coeffs_um"]) == ZERNIKE_TERMS
     assert result["fit"]["converged"]
     assert result["fit"]["last_change_mm"] <= 1e-6
     assert result["quality"]["verdict"] == "ok"
@@ -196,7 +197,7 @@ def test_all_pixels_dark_is_a_rejection(capture_set: Path, tmp_path: Path) -> No
         cv2.imwrite(str(path), np.full((256, 306), 5, np.uint8))
     code, result = measured(capture_set, tmp_path / "out")
     assert code == 3
-    assert result["zernike"]["coeffs_um"] == [None] * 36
+    assert result["zernike"]["coeffs_um"] == [None] * ZERNIKE_TERMS
 
 
 def _sixteen(folder: Path) -> None:

@@ -21,6 +21,7 @@ from membrane_ctrl.metrology.optics.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, _split, stepped
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld, Waves
 from tests.support.tracked_errors import CLEAN, MOVING, SIZE, TrackedErrors, compared, errors_of, rms
 
@@ -158,7 +159,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Still:
     reference = Figures().of(folder)
     scene = scene_of(reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
     none = np.zeros(scene.index.size, np.float32)
-    start = FrameFit(scene.surface, np.zeros((3, 36)), none, none, True)
+    start = FrameFit(scene.surface, np.zeros((3, ZERNIKE_TERMS)), none, none, True)
     everything = np.full(scene.index.size, 1e6)
     return Still(scene, FrameFitter(scene, Bands(scene.row)), scene.phase_rad(scene.surface), start, everything)
 
@@ -331,19 +332,21 @@ def light_of(world: CrossedWorld) -> Array:
 
 
 def cramer_rao_um(noise_adu: float) -> Array:
-    """Least 1 sigma (35,) of Noll terms 2 to 36 in um, with maps of level and both contrasts unknown as well."""
+    """Least 1 sigma (terms - 1,) in um of all terms but piston; maps of level and both contrasts are unknown, too."""
     setup = CLEAN | SIZE
     seen = light_of(BentWorld(**setup))  # type: ignore[arg-type]
     columns = []
-    for term in range(2, 37):
+    for term in NOLL_INDICES[1:]:
         more, less = (light_of(BentWorld(**setup, more_um={term: a})) for a in (1.0, -1.0))  # type: ignore[arg-type]
         columns.append((more - less)[:3].sum(axis=0) / 2)
-    maps = zernike.values(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(36, *seen.shape[1:])
-    every = np.array([*columns, *(wave * one for wave in seen[:3] for one in maps)]).reshape(35 + 108, -1)
+    maps = zernike.values(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(ZERNIKE_TERMS, *seen.shape[1:])
+    every = np.array([*columns, *(wave * one for wave in seen[:3] for one in maps)]).reshape(
+        4 * ZERNIKE_TERMS - 1, -1
+    )
     every = every[:, np.isfinite(every).all(axis=0)]
     fisher = every @ every.T / (noise_adu**2 + 1 / 12)
     scale = 1 / np.sqrt(np.diag(fisher))
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(fisher * np.outer(scale, scale)))) * scale)[:35]
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(fisher * np.outer(scale, scale)))) * scale)[: ZERNIKE_TERMS - 1]
 
 
 @pytest.mark.campaign

@@ -29,7 +29,7 @@ RNG = np.random.default_rng(1)
 LENS = Geometry.from_config(OpticsConfig(camera=CameraConfig(distortion=(-0.05, 0.02, 1e-3, -5e-4))))
 VALUES = np.array([0.5 * p.sigma for p in ALL]) * RNG.normal(size=len(ALL))
 SURFACE = Surface.from_parameters(
-    Surface.hencky_bowl(37.0, 500.0).parameters + np.append(RNG.normal(size=35) * 0.1, 0.0), 500.0
+    Surface.hencky_bowl(37.0, 500.0).parameters + np.append(RNG.normal(size=PARAMETERS - 1) * 0.1, 0.0), 500.0
 )
 
 

@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
 from membrane_ctrl.metrology.calibrate.verdict import after, before
 from membrane_ctrl.metrology.optics.geometry import project
 from membrane_ctrl.metrology.optics.surface import Artefact, Surface
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.simulation_spec import leaning
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
 
@@ -151,7 +152,9 @@ def test_terms_of_a_leaning_sphere() -> None:
     x, y, z = lean.apply(cap.T).T
     up = lean.as_matrix()[:, 2]
     terms = known.terms_mm(-up[0] / up[2], -up[1] / up[2])
-    surface = replace(Surface.from_parameters(terms[:36], 400.0), beyond_mm=tuple(terms[36:].tolist()))
+    surface = replace(
+        Surface.from_parameters(terms[:ZERNIKE_TERMS], 400.0), beyond_mm=tuple(terms[ZERNIKE_TERMS:].tolist())
+    )
     inside = np.hypot(x, y) < 400
     assert surface.height(x, y)[inside] == pytest.approx(z[inside], abs=1e-6)
     # a change of the curvature by a sigma deepens the bowl by that much, and form is white
@@ -165,7 +168,7 @@ def test_a_sphere_with_the_form_error_that_is_stated_is_believed() -> None:
     values, rng = drawn(7), np.random.default_rng(7)
     truth, problem = bench_of(values, 7)
     stated, geometry = sphere(250.0, 3400.0, 1e-4, 0.05), bench_at(STATED, values).geometry
-    form_um = 1e3 * stated.form_sigma_mm * rng.normal(size=36)
+    form_um = 1e3 * stated.form_sigma_mm * rng.normal(size=ZERNIKE_TERMS)
     shape = leaning(3400.0, 250.0, *rng.uniform(-2e-3, 2e-3, 2), form_um)
     column, row = rng.uniform(0, 2447, 20_000), rng.uniform(0, 2047, 20_000)
     camera = CameraPose(geometry.pinhole_mm, geometry.rotation)

@@ -13,6 +13,7 @@ from scipy.optimize import least_squares, minimize_scalar
 
 from membrane_ctrl.metrology import figure
 from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 
 APERTURE = 475.0
 AXIS = np.linspace(-APERTURE, APERTURE, 125)
@@ -96,8 +97,9 @@ def test_pv_rms_and_pvr_agree_with_prysm() -> None:
 def test_terms_of_each_index_are_those_of_prysm() -> None:
     assert [zernike.fringe(j) for j in range(1, 37)] == [tuple(fringe_to_nm(j)) for j in range(1, 37)]
     assert zernike.fringe(37) == (12, 0)
-    noll = [noll_to_nm(j) for j in range(1, 37)]
-    assert [noll[k] for k in zernike.osa_from_noll(np.arange(36))] == [tuple(ansi_j_to_nm(j)) for j in range(36)]
+    noll = [noll_to_nm(j) for j in NOLL_INDICES]
+    osa = [noll[k] for k in zernike.osa_from_noll(np.arange(ZERNIKE_TERMS))]
+    assert osa == [tuple(ansi_j_to_nm(j)) for j in range(ZERNIKE_TERMS)]
     with pytest.raises(ValueError, match="1 to 37"):
         zernike.fringe(38)
 
@@ -174,10 +176,10 @@ def test_the_spectrum_is_prysms_and_sees_a_ripple() -> None:
 def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
     """Surfaces from the same covariance, drawn by other means and evaluated in full."""
     random = np.random.default_rng(7)
-    root = np.zeros((36, 3))
+    root = np.zeros((ZERNIKE_TERMS, 3))
     root[[2, 3, 4, 10], [0, 1, 2, 1]] = 2e-3, 5e-3, 8e-3, 1e-3
     bowl = surface.Surface.hencky_bowl(37.0, 500.0)
-    true = replace(bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(36)[[4, 5, 6, 9]].sum(axis=0))
+    true = replace(bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(ZERNIKE_TERMS)[[4, 5, 6, 9]].sum(axis=0))
     evaluate = figure.FigureOf(seen(true.height(X, Y)), APERTURE)
     nominal = np.array(astuple(evaluate(seen(true.height(X, Y))).numbers))
     bars = bars_of(seen(true.height(X, Y)), root @ root.T)
@@ -193,13 +195,13 @@ def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
 
 
 def test_noise_of_cells_alone_widens_the_pv_of_a_perfect_sphere() -> None:
-    noisy = bars_of(seen(ball(3400.0)), np.zeros((36, 36)), 5e-6)
+    noisy = bars_of(seen(ball(3400.0)), np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS)), 5e-6)
     step_um = 1e3 * float(AXIS[1] - AXIS[0])
     assert 0.1 * step_um < noisy.numbers.irregularity_pv_um / 5e-6 < 20 * step_um
 
 
 def test_a_covariance_that_is_unknown_gives_no_error_bar() -> None:
-    bars = bars_of(seen(ball(3400.0)), np.full((36, 36), np.nan))
+    bars = bars_of(seen(ball(3400.0)), np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), np.nan))
     assert np.isnan(astuple(bars.numbers)).all()
     assert np.isnan(bars.fringe_um).all()
 
@@ -213,5 +215,5 @@ def test_a_figure_of_any_part_of_a_mirror(part: np.ndarray) -> None:
     height = np.where(part & INSIDE, ball(3400.0), np.nan)
     some = figure.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
     assert of(some).numbers.radius_of_curvature_mm == pytest.approx(3400, rel=1e-6)
-    bars = bars_of(some, 1e-12 * np.eye(36), 1e-6)
+    bars = bars_of(some, 1e-12 * np.eye(ZERNIKE_TERMS), 1e-6)
     assert np.isfinite(astuple(bars.numbers)).all()

@@ -13,10 +13,11 @@ from prysm.polynomials import noll_to_nm, zernike_nm
 from membrane_ctrl.metrology import film_fit
 from membrane_ctrl.metrology.optics import film_law
 from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.film import stretched
 
 RADIUS_MM, REACH = 500.0, 0.95
-ROUND = [2, 9, 20, 35]
+ROUND = [j - 2 for j in NOLL_INDICES[1:] if noll_to_nm(j)[1] == 0] + [ZERNIKE_TERMS - 1]  # and the excess
 STIFFNESS = 2.05e5
 
 
@@ -36,29 +37,34 @@ class World:
     def figures(self, seed: int) -> list[film_fit.FilmFigure]:
         """One draw."""
         rng = np.random.default_rng(seed)
-        common, wrong = self.figure_mm * rng.normal(size=36), self.follows_mm * rng.normal(size=4)
+        common, wrong = self.figure_mm * rng.normal(size=ZERNIKE_TERMS), self.follows_mm * rng.normal(size=len(ROUND))
         common[-1], wrong[-1] = common[-1] / 10, wrong[-1] / 10
         gain, offset_pa, scale = rng.normal(size=3)
         out = []
         for k, sag_mm in enumerate(self.sags_mm):
             load, profile = stretched(sag_mm / RADIUS_MM, self.prestrain, self.poisson)
-            true = np.zeros(36)
+            true = np.zeros(ZERNIKE_TERMS)
             true[ROUND] = _round_terms(sag_mm * Polynomial(profile)) + wrong * (sag_mm / 36) ** self.power
             error = self.scale * true
-            seen = true + common + gain * error + rng.normal(0, 3e-6, 36)
+            seen = true + common + gain * error + rng.normal(0, 3e-6, ZERNIKE_TERMS)
             pressure = load * STIFFNESS / 0.5 * (1 + 1e-3 * scale) + offset_pa + rng.normal(0, 0.3)
             out.append(
                 film_fit.FilmFigure(
-                    f"set{k}", seen, 9e-12 * np.eye(36), error[:, None], pressure if self.gauge else np.nan, sag_mm
+                    f"set{k}",
+                    seen,
+                    9e-12 * np.eye(ZERNIKE_TERMS),
+                    error[:, None],
+                    pressure if self.gauge else np.nan,
+                    sag_mm,
                 )
             )
         return out
 
 
 def _round_terms(height_mm: Polynomial) -> FloatArray:
-    """Noll 4, 11, 22 and the excess of a height over v, by slopes at many radii."""
+    """The round terms and the excess of a height over v, by slopes at many radii."""
     rho = REACH * np.sqrt((np.arange(1500) + 0.5) / 1500)
-    slopes = [np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2) for k in (1, 2, 3)]
+    slopes = [np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2) for k in range(1, len(ROUND))]
     slopes.append(Polynomial(film_law.excess()).deriv()(rho**2) / film_law.excess_rms())
     design = np.stack([2 * rho * slope for slope in slopes], axis=1)
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]

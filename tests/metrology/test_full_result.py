@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import FilmMotion, FullResult, measure_pixels, reconstruct_full, tukey
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
 from tests.support.tracked_errors import rms
@@ -68,7 +69,7 @@ def test_16_bit_frames_without_noise_cost_little_more() -> None:
 
 
 def test_a_hencky_bowl_with_millimetres_of_figure() -> None:
-    zernike = [0.0] * 36
+    zernike = [0.0] * ZERNIKE_TERMS
     zernike[4], zernike[5], zernike[6], zernike[8] = 1000.0, -1500.0, 800.0, 400.0
     film = FilmShape(37.0, 500.0, zernike_um=tuple(zernike))
     optics = bench(bits=16, noise_adu=0.0)

@@ -22,6 +22,7 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.shade import Light
@@ -334,7 +335,7 @@ def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
     frames, times, where = _render("full")
     live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
     estimate = live.full(frames, times, where)
-    far = np.zeros((36, 36))
+    far = np.zeros((ZERNIKE_TERMS, ZERNIKE_TERMS))
     for name, sigma in zip(PAPER_SPREAD.names, PAPER_SPREAD.sigmas, strict=True):
         ends = []
         for sign in (1.0, -1.0):

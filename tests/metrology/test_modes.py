@@ -12,6 +12,7 @@ from membrane_ctrl.metrology.track.live import Heard, Stethoscope
 from membrane_ctrl.metrology.track.modes import VibrationMode, find_modes
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, sentence
 from membrane_ctrl.model.run_events import Vibrations, from_dict
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from tests.support.vibrating_mirror import watched
 
 
@@ -115,8 +116,8 @@ def test_noise_and_drift_are_no_line(seed: int) -> None:
 def test_steps_outliers_and_rejected_frames_are_no_line_and_hide_none() -> None:
     time_s, coeffs_um, planted = watched(3, lines_hz=(48.0,))
     rng = np.random.default_rng(3)
-    coeffs_um += 0.02 * rng.normal(size=(9, 36))[np.floor((time_s - time_s[0]) / 10).astype(int)]
-    coeffs_um[rng.integers(0, time_s.size, 20)] += rng.normal(size=(20, 36))
+    coeffs_um += 0.02 * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+    coeffs_um[rng.integers(0, time_s.size, 20)] += rng.normal(size=(20, ZERNIKE_TERMS))
     coeffs_um[rng.integers(0, time_s.size, 60)] = math.nan
     found = find_modes(time_s, coeffs_um)
     assert len(found) == 1
@@ -145,8 +146,8 @@ def test_a_night_of_steps_and_outliers_tells_no_line() -> None:
     for seed in range(1000, 1480):
         time_s, coeffs_um, _ = watched(seed, lines_hz=())
         rng = np.random.default_rng(seed)
-        coeffs_um += 0.02 * rng.normal(size=(9, 36))[np.floor((time_s - time_s[0]) / 10).astype(int)]
-        coeffs_um[rng.integers(0, time_s.size, 5)] += rng.normal(size=(5, 36))
+        coeffs_um += 0.02 * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+        coeffs_um[rng.integers(0, time_s.size, 5)] += rng.normal(size=(5, ZERNIKE_TERMS))
         assert listener.search(time_s, coeffs_um) == []
 
 
@@ -179,7 +180,7 @@ def test_a_damped_mode_has_the_error_of_its_width() -> None:
 
 
 DAY_S = 86400.0
-SHAPES = np.eye(36)
+SHAPES = np.eye(ZERNIKE_TERMS)
 USUAL = {3: 48.0, 7: 61.0}
 Searches = list[dict[int, float]]
 
@@ -192,7 +193,9 @@ def heard(
     for minute, found in enumerate(lines):
         modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
         monkeypatch.setattr(live, "find_modes", lambda *_, modes=modes: modes)
-        told.append(listener.search(day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05), np.zeros((1200, 36))))
+        told.append(
+            listener.search(day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05), np.zeros((1200, ZERNIKE_TERMS)))
+        )
     return told
 
 

@@ -15,6 +15,7 @@ from membrane_ctrl.metrology.uncertainty.stability import (
     Tally,
     default_points_mm,
 )
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 
 def test_running_covariance() -> None:
@@ -44,7 +45,7 @@ def test_default_points_are_inside_and_apart() -> None:
 
 
 def _moment(time_s: float, value: float = 0.0, trials: int = 3) -> Moment:
-    return Moment(f"{time_s:g}", time_s, np.full(36, value), np.full((trials, 36), value))
+    return Moment(f"{time_s:g}", time_s, np.full(ZERNIKE_TERMS, value), np.full((trials, ZERNIKE_TERMS), value))
 
 
 def _lags(finder: PairFinder, time_s: float) -> dict[float, str]:
@@ -84,11 +85,11 @@ def test_sets_without_a_time_and_with_another_clock() -> None:
 
 def test_what_both_sets_share_cancels_trial_by_trial() -> None:
     rng = np.random.default_rng(2)
-    shared, own = rng.normal(0, 10.0, (400, 36)), rng.normal(0, 0.1, (2, 400, 36))
+    shared, own = rng.normal(0, 10.0, (400, ZERNIKE_TERMS)), rng.normal(0, 0.1, (2, 400, ZERNIKE_TERMS))
     finder = PairFinder((60.0,))
-    finder.add(Moment("a", 0.0, np.zeros(36), shared + own[0]))
-    (pair,) = finder.add(Moment("b", 60.0, np.ones(36), shared + own[1]))
-    assert pair.change == pytest.approx(np.ones(36))
+    finder.add(Moment("a", 0.0, np.zeros(ZERNIKE_TERMS), shared + own[0]))
+    (pair,) = finder.add(Moment("b", 60.0, np.ones(ZERNIKE_TERMS), shared + own[1]))
+    assert pair.change == pytest.approx(np.ones(ZERNIKE_TERMS))
     assert np.sqrt(np.diag(pair.covariance)).mean() == pytest.approx(0.1 * math.sqrt(2), rel=0.05)
 
 

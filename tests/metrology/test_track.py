@@ -16,6 +16,7 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracked import Jumps, LostOrders, TrackedFrame, steadied
 from membrane_ctrl.metrology.track.tracker import Tracker
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
@@ -88,7 +89,7 @@ def test_no_bin_of_a_scene_counts_twice(bench: Bench) -> None:
 
 
 def with_terms(by_um: dict[int, float]) -> FilmShape:
-    terms = np.zeros(36)
+    terms = np.zeros(ZERNIKE_TERMS)
     terms[: len(FILM.zernike_um)] = FILM.zernike_um
     for j, um in by_um.items():
         terms[j - 1] += um
@@ -110,7 +111,7 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
     assert 0.005 < sigma < 0.05
     assert np.abs(error - error.mean()).max() < 4 * sigma  # the anchor's own error is common
     change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 um has only m = 0
-    odd = [j for j in range(2, 37) if noll_orders(j)[1] != 0]
+    odd = [j for j in NOLL_INDICES[1:] if noll_orders(j)[1] != 0]
     assert (np.abs(change_um / frames[0].sigma_um)[[j - 1 for j in odd]] < 5 * math.sqrt(2)).all()
 
 
@@ -132,9 +133,9 @@ def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
 def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
     """The first parameter drifts, the others only scatter: as their errors do, so that they stay on the drift."""
     random, step_s = np.random.default_rng(2), 10.0 * np.arange(5)
-    drifted = np.outer(step_s, np.eye(36)[0] * 2e-6)
-    places = drifted + random.normal(0, 2e-5, (5, 36))
-    variance = np.full((5, 36), 1.6e-9)  # twice the scatter: all of it is error
+    drifted = np.outer(step_s, np.eye(ZERNIKE_TERMS)[0] * 2e-6)
+    places = drifted + random.normal(0, 2e-5, (5, ZERNIKE_TERMS))
+    variance = np.full((5, ZERNIKE_TERMS), 1.6e-9)  # twice the scatter: all of it is error
     found, left = steadied(places, variance, drifted)
     assert np.ptp(found[:, 0]) == pytest.approx(8e-5)
     assert np.ptp(found[:, 1]) == 0
@@ -145,10 +146,10 @@ def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
 
 
 def test_the_drift_is_that_of_the_mean_place_of_five_steps(bench: Bench) -> None:
-    tracker, place = bench.tracker(), np.arange(36.0)
+    tracker, place = bench.tracker(), np.arange(float(ZERNIKE_TERMS))
     assert not tracker._drift_mm_per_s(60.0, place + 5).any()  # nothing is known yet
     tracker._mean_place = 10.0, place
-    assert tracker._drift_mm_per_s(60.0, place + 5) == pytest.approx(np.full(36, 0.1))
+    assert tracker._drift_mm_per_s(60.0, place + 5) == pytest.approx(np.full(ZERNIKE_TERMS, 0.1))
 
 
 def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> None:
@@ -172,19 +173,19 @@ def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
     """The first parameter moves, the second jumps at steps, the others are noise."""
     random, jumps, expected = np.random.default_rng(1), Jumps(), []
     for k in range(60):
-        step, now = divmod(k, 10)[0], np.zeros(36)
+        step, now = divmod(k, 10)[0], np.zeros(ZERNIKE_TERMS)
         now[:2] = 0.3 * math.sin(0.2 * k), 0.05 * (-1) ** step
-        expected.append(jumps.add((float(step), 0.0), now + random.normal(0, 0.001, 36)))
+        expected.append(jumps.add((float(step), 0.0), now + random.normal(0, 0.001, ZERNIKE_TERMS)))
     assert np.flatnonzero(expected).tolist() == [10, 20, 30, 40, 50]
-    sigma = np.sqrt(jumps.variance_mm2(np.zeros(36)))
+    sigma = np.sqrt(jumps.variance_mm2(np.zeros(ZERNIKE_TERMS)))
     assert sigma[1] == pytest.approx(0.1, rel=0.05)
     assert sigma[0] < 0.01
     assert np.median(sigma) < 0.002
-    known = np.sqrt(jumps.variance_mm2(np.full(36, 0.004**2)))  # of that much the place explains
+    known = np.sqrt(jumps.variance_mm2(np.full(ZERNIKE_TERMS, 0.004**2)))  # of that much the place explains
     assert known[1] == pytest.approx(0.0998, rel=0.05)
     assert (known[2:] < sigma[2:].clip(1e-9)).all()
     jumps.begin()  # what was before is no jump
-    assert not jumps.add((9.0, 0.0), np.ones(36))
+    assert not jumps.add((9.0, 0.0), np.ones(ZERNIKE_TERMS))
 
 
 def test_what_the_next_frame_needs_may_be_made_ahead(bench: Bench) -> None:

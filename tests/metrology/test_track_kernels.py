@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from membrane_ctrl.metrology.bins import Cells
 from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.track.scene import light_left, light_waves
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 Array = NDArray[np.float64]
-COLUMNS, TERMS = 70, 36
+COLUMNS = 70
 
 
 def disc_with_holes() -> NDArray[np.intp]:
@@ -54,8 +55,8 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     _, counted, cells = Cells.of(disc_with_holes(), COLUMNS)
     bins, squares = counted.size, 64 * len(cells.offset)
     base, light = single(2, bins, scale=2), 50 + single(3, bins, scale=5)
-    slow = single(3, TERMS, 3, squares)  # derivatives of both phases; terms of the maps
-    changes, shifts = single(4, TERMS, scale=0.01), single(2)
+    slow = single(3, ZERNIKE_TERMS, 3, squares)  # derivatives of both phases; terms of the maps
+    changes, shifts = single(4, ZERNIKE_TERMS, scale=0.01), single(2)
     edge, gain = (counted * random.random(bins)).astype(np.float32), 1 + single(bins, scale=0.01)
     reach = np.where(random.random(bins) < 0.1, 0, 60).astype(np.float32)
     seen = 50 + single(bins, scale=40)
@@ -87,7 +88,7 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     by_maps = np.einsum("kiq,miq->mk", slow[2].astype(float), pull[2:])
 
     shown = base, light, cells.blocks(*slow), cells.offset, bent, changes, shifts
-    waves, out, right = np.empty((6, bins), np.float32), np.empty((4, bins), np.float32), np.empty((4, TERMS))
+    waves, out, right = np.empty((6, bins), np.float32), np.empty((4, bins), np.float32), np.empty((4, ZERNIKE_TERMS))
     light_waves(*shown, waves)
     light_left(*shown, edge, gain, seen, reach, right, out)
     np.testing.assert_allclose(waves, expected, atol=2e-3)

@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.track.live import COVARIANCE_S, LOST_S, REJECTED_S,
 from membrane_ctrl.metrology.track.tracked import rejected_frame
 from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
 from membrane_ctrl.sim.optics.film_shape import typical_film
@@ -100,7 +101,7 @@ def test_every_frame_follows_the_film(bench: Bench) -> None:
 def test_a_rounded_term_is_no_minus_zero() -> None:
     """It is no whole number of nanometres to the recorder, which then stores all bits of every term."""
     frame = replace(
-        rejected_frame(1.0, ""), coeffs_um=np.full(36, -1e-4), hencky_um=0.0, sag_um=0.0, sag_sigma_um=0.0
+        rejected_frame(1.0, ""), coeffs_um=np.full(ZERNIKE_TERMS, -1e-4), hencky_um=0.0, sag_um=0.0, sag_sigma_um=0.0
     )
     assert not np.signbit(_estimate(frame, math.nan, False, 1.0).coeffs_um).any()
 

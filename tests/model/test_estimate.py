@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from tests.support.synthetic_shape import shape_at
 
 ESTIMATE = unpack_estimate(pack_estimate(shape_at(3.0)))
 BYTES = pack_estimate(ESTIMATE)
 LINE, _, ARRAYS = BYTES.partition(b"\n")
+COEFFS_BYTES = 8 * ZERNIKE_TERMS
 
 
 def bits(estimate: ShapeEstimate) -> list[object]:
@@ -32,9 +34,19 @@ def with_head(**changed: object) -> bytes:
     "estimate",
     [
         shape_at(1.0),
-        replace(shape_at(2.0), verdict="rejected", coeffs_um=np.full(36, np.nan), sag_um=math.nan, reason="dark: ü"),
-        replace(shape_at(3.0), covariance_um2=np.random.default_rng(1).normal(size=(36, 36)), time_s=-0.0),
-        replace(shape_at(4.0), covariance_um2=np.full((36, 36), np.nan), cycle=7),
+        replace(
+            shape_at(2.0),
+            verdict="rejected",
+            coeffs_um=np.full(ZERNIKE_TERMS, np.nan),
+            sag_um=math.nan,
+            reason="dark: ü",
+        ),
+        replace(
+            shape_at(3.0),
+            covariance_um2=np.random.default_rng(1).normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS)),
+            time_s=-0.0,
+        ),
+        replace(shape_at(4.0), covariance_um2=np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), np.nan), cycle=7),
     ],
 )
 def test_an_estimate_that_was_sent_comes_back_to_the_last_bit(estimate: ShapeEstimate) -> None:
@@ -47,7 +59,8 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
     sent = shape_at(3.0)
     assert ESTIMATE.covariance_um2 == pytest.approx(sent.covariance_um2, rel=1e-7)
     assert np.array_equal(ESTIMATE.covariance_um2, sent.covariance_um2.astype(np.float32))
-    assert len(BYTES) < 7000
+    assert len(ARRAYS) == COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
+    assert len(LINE) < 1000
 
 
 @pytest.mark.parametrize(
@@ -62,7 +75,7 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
         BYTES + b"\0",
         LINE + b" " * 10_000 + b"\n" + ARRAYS,
         with_head(terms=1_000_000_000),
-        with_head(terms=-36),
+        with_head(terms=-ZERNIKE_TERMS),
         with_head(covariance_um2=[1.0]),
         with_head(__class__="x"),
         with_head(sag_um="37000"),
@@ -77,8 +90,8 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
         with_head(cycle=-1),
         with_head(cycle=2**80),
         with_head(reason=7),
-        LINE + b"\n" + np.full(36, np.inf).tobytes() + ARRAYS[288:],
-        LINE + b"\n" + ARRAYS[:288] + np.full((len(ARRAYS) - 288) // 4, np.inf, "<f4").tobytes(),
+        LINE + b"\n" + np.full(ZERNIKE_TERMS, np.inf).tobytes() + ARRAYS[COEFFS_BYTES:],
+        LINE + b"\n" + ARRAYS[:COEFFS_BYTES] + np.full(COVARIANCE_UPPER_SIZE, np.inf, "<f4").tobytes(),
     ],
     ids=range(26),
 )
@@ -100,8 +113,8 @@ def test_random_damage_is_refused_or_gives_an_estimate_of_the_right_kinds() -> N
         except ValueError:
             continue
         taken += 1
-        assert found.coeffs_um.shape == (36,)
-        assert found.covariance_um2.shape == (36, 36)
+        assert found.coeffs_um.shape == (ZERNIKE_TERMS,)
+        assert found.covariance_um2.shape == (ZERNIKE_TERMS, ZERNIKE_TERMS)
         assert isinstance(found.sag_um, float)
         assert math.isfinite(found.time_s)
     assert taken > 100

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.run_files.shapes import (
     MAP_PX,
     Scatter,
@@ -24,7 +25,7 @@ X, Y = np.meshgrid(AXIS, -AXIS)
 
 
 def flat() -> np.ndarray:
-    return np.zeros(36)
+    return np.zeros(ZERNIKE_TERMS)
 
 
 def test_a_paraboloid_is_one() -> None:
@@ -52,10 +53,12 @@ def test_outside_is_where_nothing_is() -> None:
 
 def test_uncertainty_agrees_with_drawn_coefficients() -> None:
     rng = np.random.default_rng(4)
-    root = 0.01 * rng.normal(size=(36, 36))
+    root = 0.01 * rng.normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS))
     reference = shape_of(0.0, 0)
     drawn = [
-        difference_map_um(replace(reference, coeffs_um=reference.coeffs_um + root @ rng.normal(size=36)), reference)
+        difference_map_um(
+            replace(reference, coeffs_um=reference.coeffs_um + root @ rng.normal(size=ZERNIKE_TERMS)), reference
+        )
         for _ in range(400)
     ]
     expected = np.std(drawn, axis=0)
@@ -70,7 +73,7 @@ def test_only_the_wanted_terms_are_removed(terms: int, removed: tuple[int, ...])
     coeffs_um = flat()
     coeffs_um[:7] = 3.0, -0.5, 0.7, 2.0, 0.0, 0.4, 0.2
     reference = shape_of(0.0, 0)
-    left = np.where(np.isin(np.arange(1, 37), removed), 0.0, coeffs_um)
+    left = np.where(np.isin(NOLL_INDICES, removed), 0.0, coeffs_um)
 
     def change_um(of: np.ndarray) -> np.ndarray:
         return difference_map_um(replace(reference, coeffs_um=reference.coeffs_um + of), reference)
@@ -83,7 +86,7 @@ def test_only_the_wanted_terms_are_removed(terms: int, removed: tuple[int, ...])
 
 def test_scatter_is_the_deviation_of_the_cycles() -> None:
     rng = np.random.default_rng(5)
-    cycles = 1e4 + rng.normal(size=(12, 36))
+    cycles = 1e4 + rng.normal(size=(12, ZERNIKE_TERMS))
     scatter = Scatter()
     for coeffs_um in cycles:
         scatter.add(coeffs_um)

@@ -27,6 +27,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.run_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import COLUMN, unpack
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes.child import STOP, reporter
 from membrane_ctrl.processes.ring import RingWriter, ring
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
@@ -143,7 +144,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
             assert time_s == pytest.approx(table[:, COLUMN["mono_s"]], abs=1e-9), stream.path
             assert np.array_equal(values, columns, equal_nan=True), stream.path
     assert has_footer(path)
-    assert scalars(path, "/shape/zernike")[1].shape == (4, 36)
+    assert scalars(path, "/shape/zernike")[1].shape == (4, ZERNIKE_TERMS)
     assert [word for _, word in strings(path, "/state/controller", "StateChange:state")] == [
         "standby",
         "settle",

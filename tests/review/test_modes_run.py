@@ -12,10 +12,11 @@ import pytest
 
 from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.review.statistics import modes_run
 from tests.support.vibrating_mirror import THREE_RATES, Planted, watched
 
-CALM = 1e-3 * np.random.default_rng(0).normal(size=(900, 36))
+CALM = 1e-3 * np.random.default_rng(0).normal(size=(900, ZERNIKE_TERMS))
 
 
 def tracked(folder: Path, **world: object) -> list[Planted]:
@@ -71,14 +72,26 @@ def test_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     [
         (None, Exit.BAD_INPUT, "neither a run nor the result of `membrane-ctrl track`"),
         ({"time_s": np.arange(5.0)}, Exit.BAD_INPUT, "lacks an array"),
-        ({"time_s": np.arange(9.0), "coeffs_um": np.zeros((9, 4))}, Exit.BAD_INPUT, "not 36 terms"),
-        ({"time_s": np.array([]), "coeffs_um": np.zeros((0, 36))}, Exit.REJECTED, "no usable figures"),
-        ({"time_s": np.arange(90.0), "coeffs_um": np.zeros((90, 36))}, Exit.REJECTED, "4 a second are needed"),
-        ({"time_s": np.arange(90) / 20, "coeffs_um": np.zeros((90, 36))}, Exit.REJECTED, "less than 20 s"),
-        ({"time_s": np.full(900, 7.0), "coeffs_um": np.zeros((900, 36))}, Exit.REJECTED, "less than 20 s"),
-        ({"time_s": np.arange(900) / 20, "coeffs_um": np.zeros((900, 36))}, Exit.DONE, ""),
-        ({"time_s": np.full(9, np.nan), "coeffs_um": np.full((9, 36), np.inf)}, Exit.REJECTED, "no usable figures"),
-        ({"time_s": np.arange(900) / 20, "coeffs_um": np.full((900, 36), 1e308)}, Exit.REJECTED, "no usable figures"),
+        ({"time_s": np.arange(9.0), "coeffs_um": np.zeros((9, 4))}, Exit.BAD_INPUT, f"not {ZERNIKE_TERMS} terms"),
+        ({"time_s": np.array([]), "coeffs_um": np.zeros((0, ZERNIKE_TERMS))}, Exit.REJECTED, "no usable figures"),
+        (
+            {"time_s": np.arange(90.0), "coeffs_um": np.zeros((90, ZERNIKE_TERMS))},
+            Exit.REJECTED,
+            "4 a second are needed",
+        ),
+        ({"time_s": np.arange(90) / 20, "coeffs_um": np.zeros((90, ZERNIKE_TERMS))}, Exit.REJECTED, "less than 20 s"),
+        ({"time_s": np.full(900, 7.0), "coeffs_um": np.zeros((900, ZERNIKE_TERMS))}, Exit.REJECTED, "less than 20 s"),
+        ({"time_s": np.arange(900) / 20, "coeffs_um": np.zeros((900, ZERNIKE_TERMS))}, Exit.DONE, ""),
+        (
+            {"time_s": np.full(9, np.nan), "coeffs_um": np.full((9, ZERNIKE_TERMS), np.inf)},
+            Exit.REJECTED,
+            "no usable figures",
+        ),
+        (
+            {"time_s": np.arange(900) / 20, "coeffs_um": np.full((900, ZERNIKE_TERMS), 1e308)},
+            Exit.REJECTED,
+            "no usable figures",
+        ),
         ({"time_s": np.arange(900) / 20 + 1e15 * (np.arange(900) > 450), "coeffs_um": CALM}, Exit.DONE, ""),
         ({"time_s": np.arange(900) / 20 + 1e18, "coeffs_um": CALM}, Exit.REJECTED, "less than 20 s"),
     ],

@@ -15,6 +15,7 @@ import pytest
 
 from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE
 from tests.support.review_runs import written
 from tests.support.undrawn import undrawn_figures
 
@@ -89,9 +90,12 @@ def test_slope_and_its_interval(folder: Path, report: dict[str, Any]) -> None:
 
 
 def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(36, points) orthonormal Noll terms, from the formula with factorials; piston sees to the vertex."""
+    """(terms, points) orthonormal Noll terms, from the formula with factorials; piston sees to the vertex."""
     orders = [
-        (n, m) for n in range(8) for m in sorted({abs(m) for m in range(-n, n + 1, 2)}) for _ in range(1 + (m > 0))
+        (n, m)
+        for n in range(ZERNIKE_DEGREE + 1)
+        for m in sorted({abs(m) for m in range(-n, n + 1, 2)})
+        for _ in range(1 + (m > 0))
     ]
     rho, theta, terms = np.hypot(x, y), np.arctan2(y, x), []
     for j, (n, m) in enumerate(orders, 1):
@@ -117,7 +121,7 @@ def area(folder: Path) -> np.ndarray:
 
 def test_figure_at_the_points_over_the_area_and_between_pairs(folder: Path, report: dict[str, Any]) -> None:
     shapes, said = columns(folder, "shapes"), report["shape"]
-    coeffs = np.column_stack([shapes[f"z{j}_um"] for j in range(1, 37)])
+    coeffs = np.column_stack([shapes[f"z{j}_um"] for j in NOLL_INDICES])
     assert said["used"] == len(coeffs)
     for name, (x, y) in POINTS.items():
         height_um = coeffs @ zernike(np.array([x]), np.array([y]))[:, 0]

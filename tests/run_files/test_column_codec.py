@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from membrane_ctrl.controller.tick import RECORD
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.column_codec import SUM, decode, encode, stored_schema
 
 SCHEMA = pa.schema(
@@ -73,11 +74,14 @@ def test_what_a_device_counts_in_tenths_takes_a_byte_or_two() -> None:
 
 
 def test_a_figure_of_whole_nanometres_takes_thirty_bytes() -> None:
-    """36 terms with 5 nm of noise, 20 a second: less than 60 MB a day."""
+    """Terms with 5 nm of noise, 20 a second: less than 60 MB a day."""
     rng = np.random.default_rng(2)
-    coeffs = np.round(rng.normal(scale=100, size=36) + rng.normal(scale=0.005, size=(2000, 36)), 3) + 0.0
-    field = pa.list_(pa.float64(), 36)
-    batch = pa.record_batch({"c": pa.FixedSizeListArray.from_arrays(pa.array(coeffs.ravel()), 36)})
+    coeffs = (
+        np.round(rng.normal(scale=100, size=ZERNIKE_TERMS) + rng.normal(scale=0.005, size=(2000, ZERNIKE_TERMS)), 3)
+        + 0.0
+    )
+    field = pa.list_(pa.float64(), ZERNIKE_TERMS)
+    batch = pa.record_batch({"c": pa.FixedSizeListArray.from_arrays(pa.array(coeffs.ravel()), ZERNIKE_TERMS)})
     coded, _ = encode(batch, stored_schema(pa.schema([("c", field)])))
     assert len(pa.compress(coded.column(0).buffers()[1], codec="zstd")) < 33 * 2000
     assert np.array_equal(back(batch).column("c").flatten().to_numpy(), coeffs.ravel())

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.nights import messages_of
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
 from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State, TelemetryRow, unpack
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RATE_HZ = 50.0
 STARTED_UTC = datetime(2026, 11, 21, 1, 23, 45, tzinfo=UTC)
@@ -72,17 +73,17 @@ def message_of(row: TelemetryRow) -> bytes:
 def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) -> ShapeEstimate:
     """A paraboloid 37 mm deep with an astigmatism that grows by 0.02 um/s."""
     rng = np.random.default_rng(seed + cycle)
-    coeffs_um = np.zeros(36)
+    coeffs_um = np.zeros(ZERNIKE_TERMS)
     # a paraboloid of 37 mm sag, 0 at the vertex: sag rho^2 = sag (Z4 / sqrt(3) + 1) / 2
     coeffs_um[[0, 3]] = 37_000 / 2, 37_000 / (2 * np.sqrt(3))
-    coeffs_um[1:] += 0.02 * rng.normal(size=35)
+    coeffs_um[1:] += 0.02 * rng.normal(size=ZERNIKE_TERMS - 1)
     coeffs_um[5] += 0.02 * time_s
     return ShapeEstimate(
         time_s=time_s,
         kind="full" if cycle == 0 else "fringes",
         coeffs_um=coeffs_um,
         hencky_um=0.0,
-        covariance_um2=np.diag(np.linspace(0.02, 0.005, 36) ** 2),
+        covariance_um2=np.diag(np.linspace(0.02, 0.005, ZERNIKE_TERMS) ** 2),
         sag_um=37_000.0 + 0.1 * rng.normal(),
         sag_sigma_um=0.1,
         displacement_um=10.0 + 0.1 * rng.normal(),

@@ -7,22 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.shapes import NUMBERS, Shapes
 
 
 def shape_at(time_s: float) -> ShapeEstimate:
     """The estimate of a cycle that ended just before `time_s`."""
     rng = np.random.default_rng(round(1000 * time_s))
-    coeffs_um = np.zeros(36)
+    coeffs_um = np.zeros(ZERNIKE_TERMS)
     coeffs_um[[0, 3]] = 37_000 / 2, 37_000 / (2 * np.sqrt(3))
-    coeffs_um[1:] += 0.02 * rng.normal(size=35)
-    factor = rng.normal(size=(36, 36)) * 1e-3
+    coeffs_um[1:] += 0.02 * rng.normal(size=ZERNIKE_TERMS - 1)
+    factor = rng.normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS)) * 1e-3
     return ShapeEstimate(
         time_s=time_s - 0.3 + 1e-3 * rng.random(),
         kind="fringes",
         coeffs_um=coeffs_um,
         hencky_um=rng.normal(),
-        covariance_um2=factor @ factor.T + 1e-4 * np.eye(36),
+        covariance_um2=factor @ factor.T + 1e-4 * np.eye(ZERNIKE_TERMS),
         sag_um=37_000.0 + 0.1 * rng.normal(),
         sag_sigma_um=0.1 * rng.random(),
         displacement_um=0.1 * rng.normal(),
@@ -42,8 +43,10 @@ def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
     numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in NUMBERS}
     return Shapes(
         **numbers,
-        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, 36),
+        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, ZERNIKE_TERMS),
         verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
         covariance_time_s=numbers["time_s"],
-        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(-1, 36, 36),
+        covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(
+            -1, ZERNIKE_TERMS, ZERNIKE_TERMS
+        ),
     )

@@ -29,7 +29,7 @@ class TrackedErrors:
     time_s: Array  # (m,)
     sag_um: Array  # (m,)
     sag_sigma_um: Array
-    terms_um: Array  # (m, 35): Noll 2 to 36
+    terms_um: Array  # (m, terms - 1): all terms but piston
     terms_sigma_um: Array
     verdicts: tuple[str, ...]
     reasons: tuple[str, ...]

@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from membrane_ctrl.metrology.track.modes import VibrationMode
+from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 FloatArray = NDArray[np.float64]
 THREE_RATES = (20.0, 18.4, 17.1)
 # Noll terms without lobes, on the rim and at the vertex
-RIM = {1: 1.0, 4: math.sqrt(3), 11: math.sqrt(5), 22: math.sqrt(7)}
-VERTEX = {1: 1.0, 4: -math.sqrt(3), 11: math.sqrt(5), 22: -math.sqrt(7)}
-# A drum's first vibrations, as far as 36 terms go
+_ROUND_ORDERS = {n * (n + 1) // 2 + 1: n for n in range(0, ZERNIKE_DEGREE + 1, 2)}
+RIM = {j: math.sqrt(n + 1) for j, n in _ROUND_ORDERS.items()}
+VERTEX = {j: (-1) ** (n // 2) * math.sqrt(n + 1) for j, n in _ROUND_ORDERS.items()}
+# A drum's first vibrations, up to radial order 6
 DRUM = {
     27.0: {4: -0.552, 11: 0.059},
     48.0: {2: 0.738, 8: -0.663, 16: 0.126},
@@ -48,17 +50,18 @@ def frame_times_s(rates_hz: tuple[float, ...], seconds: float) -> FloatArray:
 
 
 def at_rest(terms: FloatArray) -> FloatArray:
-    """A vibration's terms (36,), unit RMS with the ring at rest."""
+    """A vibration's terms (terms,), unit RMS with the ring at rest."""
     out = terms.copy()
     out[0] = -sum(height * terms[j - 1] for j, height in RIM.items() if j > 1)
     return out / np.linalg.norm(out)
 
 
 def drum(frequency_hz: float) -> FloatArray:
-    """A drum's vibration (36,)."""
-    out = np.zeros(36)
+    """A drum's vibration (terms,)."""
+    out = np.zeros(ZERNIKE_TERMS)
     for j, part in DRUM[frequency_hz].items():
-        out[j - 1] = part
+        if j in NOLL_INDICES:
+            out[j - 1] = part
     return at_rest(out)
 
 
@@ -81,12 +84,12 @@ def watched(
     rng = np.random.default_rng(seed)
     t = frame_times_s(rates_hz, seconds)
     t = t + jitter_s * np.random.default_rng((seed, 1)).normal(size=t.size)
-    mixed = np.linalg.qr(rng.normal(size=(36, 36)))[0]
-    terms_nm = rng.normal(size=(t.size, 36)) * noise_nm / 6 @ mixed
-    terms_nm += drift_nm * np.cumsum(rng.normal(size=(t.size, 36)), axis=0)
+    mixed = np.linalg.qr(rng.normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS)))[0]
+    terms_nm = rng.normal(size=(t.size, ZERNIKE_TERMS)) * noise_nm / 6 @ mixed
+    terms_nm += drift_nm * np.cumsum(rng.normal(size=(t.size, ZERNIKE_TERMS)), axis=0)
     planted = []
     for line_hz in lines_hz:
-        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), at_rest(rng.normal(size=36))
+        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), at_rest(rng.normal(size=ZERNIKE_TERMS))
         if drums:
             frequency_hz, shape = line_hz, drum(line_hz)
         planted.append(Planted(frequency_hz, shape))

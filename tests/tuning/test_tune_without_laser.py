@@ -13,6 +13,7 @@ import pytest
 from membrane_ctrl.config.schema import Config, EstimatorConfig, PumpConfig, ShapeConfig
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sessions.folder import SessionFolder, create_session
 from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import pump_trial, session
@@ -26,8 +27,8 @@ SIGMA_UM = 0.036
 
 def figure(time_s: float, sag_um: float, number: int = 0) -> ShapeEstimate:
     return ShapeEstimate(
-        time_s, "track", np.full(36, sag_um / 100), 0.0, SIGMA_UM**2 * np.eye(36), sag_um, SIGMA_UM, math.nan, 1.0,
-        1.0, 80.0, 0.0, "ok", cycle=number,
+        time_s, "track", np.full(ZERNIKE_TERMS, sag_um / 100), 0.0, SIGMA_UM**2 * np.eye(ZERNIKE_TERMS),
+        sag_um, SIGMA_UM, math.nan, 1.0, 1.0, 80.0, 0.0, "ok", cycle=number,
     )  # fmt: skip
 
 

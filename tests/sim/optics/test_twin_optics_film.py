@@ -1,4 +1,4 @@
-"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients that 36 terms represent."""
+"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients of the fitted terms."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from scipy.integrate import quad
 from scipy.special import jn_zeros, jv
 
 from membrane_ctrl.metrology.optics.film_law import FilmLaw, finite_rise_mm
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 from membrane_ctrl.sim import film as hencky
 from membrane_ctrl.sim.optics.disturbances import DRUM_MODES, DrumMode
 from membrane_ctrl.sim.optics.film_shape import (
+    MAX_FILM_TERMS,
     Bump,
     FilmShape,
     Ripple,
@@ -28,7 +30,7 @@ from membrane_ctrl.sim.optics.film_shape import (
 
 RICH = FilmShape(
     37.1,
-    zernike_um=tuple(float(v) for v in np.random.default_rng(3).normal(0.0, 200.0, 36)),
+    zernike_um=tuple(float(v) for v in np.random.default_rng(3).normal(0.0, 200.0, MAX_FILM_TERMS)),
     ripples=(Ripple(5.0, 60.0, 30.0, 0.4), Ripple(2.0, 25.0)),
     wrinkles=(Wrinkle(80.0, 24, 1.0),),
     bumps=(Bump(30.0, 100.0, -50.0, 40.0),),
@@ -119,21 +121,23 @@ def test_the_rim_stays_where_it_is() -> None:
     np.testing.assert_allclose(RICH.height_mm(x, y, 250.0) - RICH.height_mm(x, y), 0.250, atol=1e-11)
 
 
-def test_coefficients_of_a_shape_of_36_terms_give_its_heights() -> None:
-    film = FilmShape(37.1, bowl="paraboloid", zernike_um=RICH.zernike_um)
+def test_coefficients_of_a_shape_of_the_fitted_terms_give_its_heights() -> None:
+    film = FilmShape(37.1, bowl="paraboloid", zernike_um=RICH.zernike_um[:ZERNIKE_TERMS])
     coeffs_um = film.coeffs_um(400.0)
     assert coeffs_um is not None
     flat = FilmShape(0.0, bowl="paraboloid", zernike_um=tuple(coeffs_um))
     x, y = np.random.default_rng(5).uniform(-350.0, 350.0, (2, 40))
     np.testing.assert_allclose(flat.height_mm(x, y), film.height_mm(x, y, 400.0), atol=1e-11)
     # piston included: the sum of the terms is 0 at the vertex, where only the rotationally symmetric ones are not
-    at_vertex = {0: 1.0, 2: -np.sqrt(3.0), 4: np.sqrt(5.0), 6: -np.sqrt(7.0)}
+    at_vertex = {n: (-1) ** (n // 2) * np.sqrt(n + 1.0) for n in range(0, ZERNIKE_DEGREE + 1, 2)}
     total = sum(c * at_vertex[noll_orders(j)[0]] for j, c in enumerate(coeffs_um, 1) if noll_orders(j)[1] == 0)
     assert total == pytest.approx(0.0, abs=1e-9)
 
 
-def test_what_36_terms_cannot_carry_has_no_coefficients() -> None:
+def test_what_the_fitted_terms_cannot_represent_has_no_coefficients() -> None:
     assert FilmShape(37.1).coeffs_um() is None
+    finer_um = (*[0.0] * ZERNIKE_TERMS, 1.0)[:MAX_FILM_TERMS]
+    assert (FilmShape(37.1, bowl="paraboloid", zernike_um=finer_um).coeffs_um() is None) == any(finer_um)
     assert FilmShape(37.1, bowl="paraboloid", ripples=(Ripple(1.0, 50.0),)).coeffs_um() is None
 
 
