@@ -15,7 +15,8 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.control_port.server import metrics_text
-from membrane_ctrl.model.telemetry import FIELDS, RunStatus, TelemetryRow
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.sim.lab import Lab
 
 EXAMPLES = sorted(Path(__file__).parents[1].glob("membrane_ctrl/examples/*.toml"))

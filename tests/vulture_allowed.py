@@ -31,8 +31,9 @@ _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose
 _.enters  # a rule's level for people, in the generated page
 _.by_password  # a login in one call, for tests and programs
 PageLoop  # named as text to uvicorn
+_.culprit  # in the template of a sentence
 # fields of a hold's messages: declared to be checked, and read by their keys
-_.state, _.why, _.run, _.fault, _.row, _.maintenance, _.recording, _.gains, _.geometry, _.safe_level, _.shape
+_.state, _.why, _.run, _.fault, _.row, _.notices, _.recording_ok, _.gains, _.geometry, _.safe_level, _.shape
 _.shape_reason, _.state_age_s, _.trial_left_s, _.commander, _.command_session, _.clients, _.mono_s, _.refused
 _.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _.since_utc, _.kp_per_s, _.ti_s, _.td_s
 find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults.md, the safety case and the campaign

@@ -11,12 +11,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from membrane_ctrl.config.port import AlarmRule, AlarmsConfig
-from membrane_ctrl.model import events, run_events
-
-Severity = Literal["warning", "critical"]
-
-_GLITCH_S = 5.0  # a fault that only holds the flow for a few samples must not wake anyone
-_LIARS = {"laser": "the laser", "optics": "the camera"}
+from membrane_ctrl.model.notices import NoticeChanges, Severity
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,79 +28,22 @@ class Sign:
     anew: bool = False  # once all conditions have cleared, the next one is a new alarm, however soon
 
 
-def signs_of(event: events.Event) -> list[Sign]:
-    """Signs in an event; most have none."""
-    match event:
-        case events.Fault():
-            text = f"{event.name}: {event.cause} ({event.seen}; {event.limit}); {event.remedy}"
-            if event.latching:
-                return [Sign("fault", True, "critical", text, anew=True)]
-            return [Sign("glitch", True, "warning", text, _GLITCH_S)]
-        case events.Cleared():
-            return [Sign("glitch", False)]
-        case events.StateEntered(from_="fault"):
-            return [Sign("fault", False), Sign("glitch", False)]
-        case events.LockSet():
-            session = f" ({event.session})" if event.session else ""
-            text = f'"{event.text}" by {event.author}{session}, {event.set_utc}, word {event.word}'
-            return [Sign("lock", True, "warning", text, about=event.word)]
-        case events.LockRemoved():
-            return [Sign("lock", False, about=event.word), Sign("lock_storage", False, about=event.word)]
-        case events.Maintenance():
-            return [Sign(f"maintenance_{event.name}", True, "warning", event.message)]
-        case events.MaintenanceOver():
-            return [Sign(f"maintenance_{event.name}", False)]
-        case events.InterlockOpened():
-            return [
-                Sign("interlock", True, "warning", f"interlock {event.name} is open: {event.text}", about=event.name)
-            ]
-        case events.InterlockClosed():
-            return [Sign("interlock", False, about=event.name)]
-        case events.Plausibility():
-            who = _LIARS.get(event.liar, "one of them")
-            text = f"laser and camera do not agree; {who} is wrong ({event.seen})"
-            return [Sign("plausibility", event.liar != "nobody", "warning", text)]
-    return _signs_of_process(event)
-
-
-def _signs_of_process(event: events.Event) -> list[Sign]:
-    match event:
-        case run_events.Link():
-            return [Sign("link", not event.up, "warning", event.message, _GLITCH_S)]
-        case run_events.ChildEnded():
-            text = f"the {event.child} process ended with {event.exit_code}; the hold continues"
-            return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
-        case run_events.ChildSilent():
-            text = f"the {event.child} process does not answer; the hold continues"
-            return [Sign(f"{event.child}_ended", True, "warning", text, _GLITCH_S)]
-        case run_events.ChildGivenUp():
-            text = f"the {event.child} process has ended too often and is not restarted for an hour; check the run"
-            return [Sign(f"{event.child}_ended", True, "warning", text)]
-        case run_events.ChildRestarted():
-            ended = Sign(f"{event.child}_ended", False)
-            # a new recorder knows nothing about its predecessor's problems and reports again those that remain
-            return [ended, Sign("recorder", False)] if event.child == "recorder" else [ended]
-        case run_events.RecorderError() | run_events.DiskLow():
-            return [Sign("recorder", True, "warning", event.message, about=event.what)]
-        case run_events.RecorderRecovered():
-            return [Sign("recorder", False, about=event.what)]
-        case run_events.PortFailed():
-            return [Sign("port", True, "warning", f"the control port failed: {event.message}", _GLITCH_S)]
-        case run_events.PortOpen():
-            return [Sign("port", False)]
-        case run_events.LatchFailed():
-            text = f"the fault may be forgotten at the next start: {event.message}"
-            return [Sign("latch", True, "critical", text)]
-        case run_events.LatchWritten():
-            return [Sign("latch", False)]
-        case run_events.LockNotStored():
-            text = f"the lock {event.word} is not as stored: {event.message}"
-            return [Sign("lock_storage", True, "critical", text, about=event.word)]
-        case run_events.LockStored():
-            return [Sign("lock_storage", False, about=event.word)]
-        case run_events.Ended() if event.exit not in ("done", "interrupted"):
-            return [Sign("run_ended", True, "critical", f"the run has ended: {event.exit}")]
-    return []
+def signs_of(changes: NoticeChanges) -> list[Sign]:
+    """Signs in the notices that an event closes and opens."""
+    cleared = [Sign(key.alarm, False, about=key.subject) for key in changes.closed]
+    appeared = [
+        Sign(
+            notice.key.alarm,
+            True,
+            notice.severity,
+            notice.text,
+            notice.delay_s,
+            notice.key.subject,
+            notice.always_new,
+        )
+        for notice in changes.opened
+    ]
+    return cleared + appeared
 
 
 def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:

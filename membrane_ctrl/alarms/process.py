@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,9 @@ from membrane_ctrl.config import schema
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model import errors, files, run_events
 from membrane_ctrl.model.clock import RunClock, pause_s
-from membrane_ctrl.model.events import CommandTaken, Event, EventLine, StateEntered
-from membrane_ctrl.model.telemetry import RunStatus, TelemetryRow
+from membrane_ctrl.model.events import CommandTaken, Event, EventLine
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes import child, ring
 
 Send = Callable[[Notice], bool]
@@ -194,14 +195,12 @@ class Watcher:
 
     def _take_event(self, line: EventLine, now_s: float) -> None:
         event = run_events.from_dict(line)
+        signs = signs_of(event.notice_changes(self._status.notices))
         self._status = self._status.after_event(event)
-        fault = self._status.fault
         match event:
-            case StateEntered(state="fault") if fault is not None and not fault.latching:
-                event = replace(fault, latching=True)  # latched after too long on the mean flow
             case run_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
                 self._book.acknowledge()  # whoever sends `ack` has seen the alarms, even if the hold refuses it
-        for sign in signs_of(event):
+        for sign in signs:
             self._book.take(sign, now_s)
 
     def _take_row(self, message: bytes, now_s: float) -> None:

@@ -27,7 +27,7 @@ from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
 from membrane_ctrl.geometry.file import geometry_in_force
 from membrane_ctrl.instruments import bench, driver_loading, lock_store
-from membrane_ctrl.model import errors, plain_json, telemetry, terminal
+from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
 
 _READS = 100
@@ -161,7 +161,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
         "hold": f"{loop.setpoint_um:g} um at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
         f"{limits.displacement_max_um:g} um and {limits.gauge_pressure_max_pa:g} Pa",
-        "gains": telemetry.gains_words(loop.model_dump(), None),
+        "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _geometry(config),
         "shape loop": figures if shape.enabled else "off",

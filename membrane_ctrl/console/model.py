@@ -8,7 +8,7 @@ from statistics import fmean, pstdev
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, go_on, is_paused, number, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
-from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import events, run_events, run_status, shape_estimate, telemetry
 from membrane_ctrl.model.lock import describe_lock
 
 MINUTE_S = 60
@@ -91,8 +91,7 @@ class ConsoleView:
     too_tight: bool  # the leak is too small for the band
     gains: str  # in force, with the countdown of a trial
     flow_most_um_per_s: float  # with the curve in force
-    interlocks: tuple[str, ...]  # each open interlock with its text
-    recording: str  # what prevents recording; empty if nothing does
+    notices: tuple[str, ...]  # a sentence each; neither of faults nor of locks
     events: tuple[events.EventLine, ...]  # the last ones, oldest first
     shape: ShapeView
 
@@ -109,7 +108,7 @@ class ConsoleModel:
         self._ctl, self._keys = ctl, keys
         self._config = config
         self._duration_s = math.inf if duration_s is None else duration_s
-        self._status = telemetry.RunStatus()
+        self._status = run_status.RunStatus()
         self._started_s = math.nan
         self._error = Trend()
         self._lateness = Trend()
@@ -173,15 +172,14 @@ class ConsoleModel:
             error_std_um=pstdev(errors) if errors else math.nan,
             in_band_fraction=fmean(abs(e) <= band_um for e in errors) if errors else math.nan,
             lateness_max_ms=max(self._lateness.values(), default=math.nan),
-            fault=_fault_words(status.fault),
+            fault=fault_words(status.fault),
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,
-            last_fault=f"{_fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
+            last_fault=f"{fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
             too_tight=self._too_tight(now_s),
-            gains=telemetry.gains_words(vars(in_force.loop), status.trial_left_s),
+            gains=run_status.gains_words(vars(in_force.loop), status.trial_left_s),
             flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
-            interlocks=status.interlock_lines,
-            recording=status.recording_words,
+            notices=tuple(notice.short_text for notice in status.other_notices),
             events=tuple(self._events),
             shape=self._shape(now_s),
         )
@@ -195,7 +193,7 @@ class ConsoleModel:
         status = self._status
         if status.row is None:
             return status.why or "starting: no tick yet"
-        return why(status.row, status.why, _fault_words(status.fault), self._config)
+        return why(status.row, status.why, fault_words(status.fault), self._config)
 
     def _shape(self, now_s: float) -> ShapeView:
         estimate, since, row, status = self._estimate, self._reference, self._status.row, self._status
@@ -215,34 +213,18 @@ class ConsoleModel:
         )
 
 
-def _fault_words(fault: events.Fault | None) -> str:
-    return "" if fault is None else text(fault.to_dict()) or "unnamed"
-
-
 def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
     return "" if said is None or said.state == "running" else ": ".join(w for w in (said.state, said.message) if w)
 
 
-def text(line: events.EventLine) -> str:
-    """An event's name, reason and observed value, where present."""
-    name = str(line.get("name", "")).replace("_", " ")
-    reason = next((str(line[key]) for key in ("why", "reason", "cause", "message") if line.get(key)), "")
-    seen = f" ({line['seen']})" if line.get("seen") else ""
-    return ": ".join(words for words in (name, reason) if words) + seen
+def fault_words(fault: events.Fault | None) -> str:
+    """Name, cause and observed value of a fault; empty without one."""
+    if fault is None:
+        return ""
+    cause = ": ".join(words for words in (fault.name.replace("_", " "), fault.cause) if words)
+    return f"{cause or 'unnamed'}{f' ({fault.seen})' if fault.seen else ''}"
 
 
-def event_words(event: events.EventLine) -> str:
-    """Format an event as one line, without its time."""
-    what = " ".join(str(event[key]) for key in ("state", "child", "exit", "command") if event.get(key) is not None)
-    words = " ".join(f"{what} {text(event)}".split())  # one line, even for multi-line errors
-    more = "".join(
-        f"{link}{event[key]}"
-        for link, key in (("; ", "remedy"), (": ", "text"), (", by ", "who"), ("; refused: ", "refused"))
-        if event.get(key)
-    )
-    return f"{str(event.get('kind', '?')).upper()} {words}{more}".rstrip()
-
-
-def event_line(event: events.EventLine) -> str:
+def event_line(line: events.EventLine) -> str:
     """Format an event as one line of a log."""
-    return f"{number(event.get('mono_s', math.nan), 1):>9} s  {event_words(event)}"
+    return f"{number(line.get('mono_s', math.nan), 1):>9} s  {run_events.from_dict(line).sentence}"

@@ -21,17 +21,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import keys, model, why
 from membrane_ctrl.console.quantities import labelled
 from membrane_ctrl.console.view import ConsolePage
-from membrane_ctrl.model import clock, events, run_events, shape_estimate, telemetry, terminal
+from membrane_ctrl.model import clock, run_events, shape_estimate, telemetry, terminal
+from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes import child, ring
-
-# For a log file: one line per second, and these at once
-_AT_ONCE = (
-    events.LockSet | events.LockRemoved | run_events.LockNotStored
-    | events.Fault | events.Cleared | events.StateEntered | run_events.Link | run_events.Ended
-    | run_events.ChildEnded | run_events.ChildSilent | run_events.ChildRestarted | run_events.ChildGivenUp
-    # a full disk cannot store the event either
-    | run_events.RecorderError | run_events.DiskLow | run_events.RecorderRecovered
-)  # fmt: skip
 
 
 def line(view: model.ConsoleView) -> str:
@@ -53,19 +45,10 @@ def line(view: model.ConsoleView) -> str:
     parts += [f"LOCKED {lock}" for lock in view.locks]
     if view.go_on:
         parts.append(view.go_on)
-    if view.recording:
-        parts.append(f"RECORDING {view.recording}")
+    parts += view.notices
     if math.isfinite(view.left_s):
         parts.append(f"{why.duration(view.left_s)} left")
     return "  ".join(parts)
-
-
-def at_once(line: events.EventLine) -> bool:
-    """Whether to show the event at once."""
-    event = run_events.from_dict(line)
-    if isinstance(event, run_events.AcquisitionState):
-        return event.state != "running"
-    return isinstance(event, _AT_ONCE)
 
 
 def _shape_words(view: model.ConsoleView) -> str:
@@ -149,13 +132,13 @@ class _Feed:
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
 
-    def update(self) -> list[events.EventLine]:
+    def update(self) -> list[EventLine]:
         """Take all new messages; returns the events."""
         for message in self._telemetry.drain():
             self.model.take_row(telemetry.TelemetryRow.unpack(message))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(shape_estimate.unpack_estimate(message))
-        lines: list[events.EventLine] = [json.loads(message) for message in self._events.drain()]
+        lines: list[EventLine] = [json.loads(message) for message in self._events.drain()]
         for line in lines:
             self.model.take_event(line)
         return lines
@@ -219,7 +202,7 @@ def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
         lines = [
             model.event_line(event)
             for event in feed.update()
-            if at_once(event) and event.get("mono_s", math.inf) >= spec.since_s
+            if run_events.from_dict(event).notable and event.get("mono_s", math.inf) >= spec.since_s
         ]
         now_s = spec.clock.now()
         if now_s >= due_s:

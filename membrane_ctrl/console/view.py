@@ -11,13 +11,17 @@ from rich.text import Text
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
-from membrane_ctrl.console.model import ConsoleView, ShapeView, event_words
+from membrane_ctrl.console.model import ConsoleView, ShapeView
 from membrane_ctrl.console.quantities import labelled, quantity
 from membrane_ctrl.console.why import duration, holders, number, percent
 from membrane_ctrl.model import columns, telemetry
 from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
+from membrane_ctrl.model.event_base import Event, Level
+from membrane_ctrl.model.events import StateEntered
+from membrane_ctrl.model.run_events import from_dict
 
 _LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
+_NOTICES_SHOWN = 3
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
 
 
@@ -74,7 +78,7 @@ _LABELS = 8  # characters
 _EDGES = 5 + _LABELS  # borders, padding and labels beside a trend
 _BAR_ROWS_MAX = 6
 _EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
-_EVENT_STYLES = {"fault": "bold red", "cleared": "green", "state": "bold", "command": "cyan", "refused": "yellow"}
+_LEVEL_STYLES = {Level.ERROR: "bold red", Level.WARNING: "yellow"}
 
 
 class ConsolePage:
@@ -147,11 +151,20 @@ def _events(view: ConsoleView, lines: int) -> list[RenderableType]:
     if lines < _EVENTS_MIN:
         return [Text()] * lines
     made: list[RenderableType] = [Text("events, in UTC", style="dim")]
-    for event in view.events[1 - lines :]:
-        style = _EVENT_STYLES.get(str(event.get("kind")), "")
-        line = Text(str(event.get("time_utc", ""))[11:19] + "  ", style="dim", no_wrap=True, overflow="ellipsis")
-        made.append(line.append(event_words(event), style=style or "default"))
+    for event_line in view.events[1 - lines :]:
+        event = from_dict(event_line)
+        line = Text(str(event_line.get("time_utc", ""))[11:19] + "  ", style="dim", no_wrap=True, overflow="ellipsis")
+        made.append(line.append(event.sentence, style=_style_event(event)))
     return [*made, *[Text()] * lines][:lines]
+
+
+def _style_event(event: Event) -> str:
+    """Errors and warnings in their colours, green for the end of a notice, bold for a state."""
+    if event.level in _LEVEL_STYLES:
+        return _LEVEL_STYLES[event.level]
+    if isinstance(event, StateEntered):
+        return "bold"
+    return "green" if event.closes else "default"
 
 
 def _help(lines: int) -> list[RenderableType]:
@@ -206,10 +219,10 @@ def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]
     ):
         if label not in omitted:
             table.add_row(label, line)
-    for line in view.interlocks:
-        table.add_row("open", Text(line, style="bold yellow"))
-    if view.recording:  # one line only: with a full disk every file reports an error
-        table.add_row("recorder", Text(view.recording, style="bold yellow", no_wrap=True, overflow="ellipsis"))
+    hidden = len(view.notices) - _NOTICES_SHOWN
+    more = [f"and {hidden} more"] if hidden > 0 else []  # with a full disk every file has a notice
+    for text in [*view.notices[:_NOTICES_SHOWN], *more]:
+        table.add_row("notice", Text(text, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     return table
 
 

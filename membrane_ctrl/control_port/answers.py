@@ -144,16 +144,25 @@ class SessionPart(_Part):
     since_utc: _Text
 
 
+class StandingPart(_Part):
+    """A notice that stands (`notices.Notice`)."""
+
+    topic: _Name
+    subject: _Text
+    severity: _Name
+    text: _Text
+
+
 class StatusPart(_Part):
-    """A hold's status (`server.status_table` and `Port.status`)."""
+    """A hold's status (`status.status_table` and `Port.status`)."""
 
     state: _Name
     why: _Text
     run: RunName | None = None
     fault: FaultPart | None = None
     row: dict[_Name, _Number | None] | None = None
-    maintenance: dict[str, _Text] = {}
-    recording: dict[str, _Text] = {}
+    notices: list[StandingPart] = []
+    recording_ok: Annotated[bool, Field(strict=True)] = True
     gains: GainsPart | None = None
     geometry: GeometryPart | None = None
     safe_level: _Name | None = None

@@ -3,9 +3,9 @@
 import json
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,9 @@ from membrane_ctrl.config.toml_file import load, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession
-from membrane_ctrl.model import errors, files, plain_json, telemetry, terminal
+from membrane_ctrl.control_port.status import alarm_lines
+from membrane_ctrl.model import errors, files, plain_json, run_status, terminal
 from membrane_ctrl.model.columns import COLUMNS, PUBLISHED
-from membrane_ctrl.model.lock import Lock, describe_lock
-
-_LOCK_FIELDS = tuple(field.name for field in fields(Lock))
 
 _LABEL_WIDTH = 18
 _WATCHED = ("mono_s", "error_um", "pump_fraction")
@@ -109,60 +107,28 @@ def fleet_line(status: dict[str, Any]) -> str:
     """A hold's status in one line: state, error, and what is wrong or why it is as it is."""
     if "problem" in status:
         return f"{'no contact':10}{'':14}{status['problem']}"
-    row, fault = status.get("row") or {}, status.get("fault")
-    parts = ("interlocks", "maintenance", "recording")
-    notices = [str(each) for part in parts for each in status.get(part, {}).values()]
-    words = [f"LOCKED {line}" for line in lock_lines(status)]
-    words += [f"FAULT {fault['code']} {fault['name']}: {fault['remedy']}"] if fault else []
-    words += notices or [str(status.get("why") or "as it should be")]
+    words = alarm_lines(status) or [str(status.get("why") or "as it should be")]
     error = COLUMNS["error_um"]
-    shown = f"{error.format_value(row.get(error.name)):>10} {error.unit}"
+    error_um = (status.get("row") or {}).get(error.name)
+    shown = f"{error.format_value(error_um):>10} {error.unit}"
     return f"{status['state']:10}{shown} {'; '.join(words)}"
-
-
-def lock_lines(status: Mapping[str, Any]) -> list[str]:
-    """Return a line for each lock of a status: text, author, time, word, and whether it is not stored.
-
-    Parameters
-    ----------
-    status : mapping
-        As the port answers it.
-
-    Returns
-    -------
-    list of str
-    """
-    lines = []
-    stated = status.get("locks")
-    for each in stated if isinstance(stated, list) else ():
-        if not isinstance(each, dict):
-            continue
-        lock = Lock(**{name: str(each.get(name, "")) for name in _LOCK_FIELDS})
-        problem = each.get("problem")
-        lines.append(describe_lock(lock) + (f"; NOT STORED: {problem}" if problem else ""))
-    return lines
 
 
 def status_lines(status: dict[str, Any]) -> list[str]:
     """Format the status for people."""
-    row, fault = status.get("row") or {}, status.get("fault")
+    row = status.get("row") or {}
     lines = [f"{status.get('run', '?')}: {status['state']} - {status['why'] or 'as it should be'}"]
-    lines += [f"LOCKED {line}" for line in lock_lines(status)]
-    if fault:
-        lines.append(f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}")
-    lines += [f"OPEN {message}" for message in status.get("interlocks", {}).values()]
+    lines += alarm_lines(status)
     if row:
         lines += [
             f"  {each.label:{_LABEL_WIDTH}}{each.format_value(row.get(each.name)):>10} {each.unit}".rstrip()
             for each in PUBLISHED
         ]
         if gains := status.get("gains"):
-            lines.append(f"  {'gains':{_LABEL_WIDTH}}{telemetry.gains_words(gains, status.get('trial_left_s'))}")
+            lines.append(f"  {'gains':{_LABEL_WIDTH}}{run_status.gains_words(gains, status.get('trial_left_s'))}")
         shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
         lines.append(f"  {'shape loop':{_LABEL_WIDTH}}{shape}".rstrip())
         lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_geometry(status.get('geometry'))}")
-    lines += [f"  {'maintenance':{_LABEL_WIDTH}}{message}" for message in status.get("maintenance", {}).values()]
-    lines += [f"  {'recording':{_LABEL_WIDTH}}{message}" for message in status.get("recording", {}).values()]
     lines.append(f"  {'commander':{_LABEL_WIDTH}}{_commander(status)}")
     return lines
 

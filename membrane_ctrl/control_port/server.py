@@ -24,10 +24,12 @@ from membrane_ctrl.control_port.protocol import FREE, Peer, Sender, may_not
 from membrane_ctrl.control_port.request_intake import ReadingTurns
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.session import PortSession
+from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.instruments.lock_store import draw_word
 from membrane_ctrl.model import errors, events, run_events, telemetry
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.run_status import RunStatus
 
 # Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out another's `stop`
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
@@ -58,7 +60,7 @@ class Port:
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
         self._refusals = Refusals(hooks.tell, hooks.now)
-        self._status = telemetry.RunStatus()
+        self._status = RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._changed: dict[int, dict[str, str]] = {}  # by number of the request: the lock that it set or removed
@@ -350,7 +352,7 @@ _REQUEST_S = 2.0
 _COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
-def metrics_text(status: telemetry.RunStatus, clients: int, refused: int) -> str:
+def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
     """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
     lines: list[str] = []
 
@@ -361,7 +363,7 @@ def metrics_text(status: telemetry.RunStatus, clients: int, refused: int) -> str
     add("port_clients", "gauge", ("", clients))
     add("port_refused_total", "counter", ("", refused))
     add("locks", "gauge", ("", len(status.locks)))
-    add("recording_ok", "gauge", ("", not status.recording))
+    add("recording_ok", "gauge", ("", not status.recording_problems))
     row = status.row
     if row is not None:
         add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State))
@@ -392,28 +394,3 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
             )
     finally:
         await wire.close()
-
-
-def status_table(status: telemetry.RunStatus) -> dict[str, Any]:
-    """The status for people and programs: names instead of codes, None for missing values."""
-    row = status.row
-    if row is None:
-        return {"state": "starting", "why": "no tick has run yet"}
-    fault, geometry = status.fault, status.geometry
-    return {
-        "state": telemetry.State(int(row.state)).name.lower(),
-        "state_age_s": round(row.mono_s - status.since_s, 3),
-        "why": status.why,
-        "locks": [{**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks],
-        "latched": status.latched,
-        "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
-        "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
-        "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),
-        "shape_reason": status.shape_reason,
-        "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,
-        "geometry": asdict(geometry) if geometry else None,
-        "interlocks": dict(zip(status.interlocks, status.interlock_lines, strict=True)),
-        "maintenance": dict(status.maintenance),
-        "recording": dict(status.recording),
-        "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
-    }

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.control_port.ctl import Where, lock_lines
+from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.control_port.safety_commands import is_safety_command
+from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.doors.command_lanes import CommandLanes
 from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.columns import PUBLISHED, unit_of
+from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.model.numbers import parse_number
 from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
@@ -57,7 +59,7 @@ _TEXTS = (
     Published("fault", "the fault with its cause and remedy; empty without one", is_text=True),
     Published("locks", "the locks: text, author, time and word of each; empty without one", is_text=True),
     Published("interlocks", "the open interlocks with their texts; empty without one", is_text=True),
-    Published("notices", "maintenance notices, and what fails in the recording", is_text=True),
+    Published("notices", "all notices: open interlocks, maintenance, recording, link, processes", is_text=True),
     Published("figure_verdict", "verdict on the newest figure", is_text=True),
     Published("answer", "what became of the last command of any door", is_text=True),
 )
@@ -71,15 +73,13 @@ def values(seen: HoldSeen) -> dict[str, Value]:
     if seen.silent:
         return {**found, "state": "no contact", "why": seen.silent}
     status, row = seen.status, seen.status.get("row") or {}
-    fault = status.get("fault")
-    notices = [str(each) for part in ("maintenance", "recording") for each in status.get(part, {}).values()]
     found |= {
         "state": str(status.get("state", "")),
         "why": str(status.get("why") or "as it should be"),
-        "fault": "{code} {name}: {cause}; {remedy}".format_map(fault) if fault else "",
+        "fault": fault_line(status),
         "locks": "; ".join(lock_lines(status)),
-        "interlocks": "; ".join(str(each) for each in status.get("interlocks", {}).values()),
-        "notices": "; ".join(notices),
+        "interlocks": "; ".join(notice_lines(status, Topic.INTERLOCK)),
+        "notices": "; ".join(notice_lines(status)),
     }
     found |= {each.name: row.get(each.name) for each in _TICK}
     if seen.figure is not None:

@@ -14,6 +14,7 @@ from functools import partial
 
 from membrane_ctrl.controller import tick
 from membrane_ctrl.model import events, run_events, telemetry
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
 
@@ -140,7 +141,7 @@ class SystemdNotify:
         self._address = (address or os.environ.get("NOTIFY_SOCKET", "")).replace("@", "\0", 1)
         self._next_s = -math.inf
         self._state = -1.0
-        self._status = telemetry.RunStatus()
+        self._status = RunStatus()
 
     def __enter__(self) -> SystemdNotify:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -166,7 +167,8 @@ class SystemdNotify:
         error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
         locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
-        trouble = f", recording: {self._status.recording_words}" if self._status.recording else ""
+        problems = self._status.recording_problems
+        trouble = f", recording: {'; '.join(problems)}" if problems else ""
         self._send(
             f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{locked}{trouble}"
         )

@@ -4,12 +4,20 @@ import json
 import math
 from typing import Any
 
-from membrane_ctrl.model.events import KINDS, Event, EventLine
+from membrane_ctrl.model.event_base import KINDS, Event, EventLine, Level, UnknownEvent
+from membrane_ctrl.model.notices import GLITCH_S, NoticeChanges, NoticeKey, Notices, Topic
+
+CONNECTED_AGAIN = "connected again"
+_ENDED_WELL = frozenset({"done", "interrupted"})
+_EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
+
 
 # Events of the control process.
 
 
-class Started(Event, kind="start"):
+class Started(
+    Event, kind="start", sentence="Run started[ on {devices}][, {priority} priority][; {message}]", notable=True
+):
     """The run starts."""
 
     devices: str
@@ -17,7 +25,15 @@ class Started(Event, kind="start"):
     message: str
 
 
-class Ended(Event, kind="end"):
+class Ended(
+    Event,
+    kind="end",
+    sentence="Run ended: {exit}",
+    opens=(Topic.RUN_END,),
+    severity="critical",
+    notable=True,
+    urgent=True,
+):
     """The run is over; without the control process the recorder knows only `exit`."""
 
     exit: str
@@ -25,72 +41,136 @@ class Ended(Event, kind="end"):
     ticks: int | None = None
     missed_ticks: int | None = None
 
+    @property
+    def stands(self) -> bool:
+        """Whether it ended by itself, not because a person or its duration ended it."""
+        return self.exit not in _ENDED_WELL
 
-class NoClaim(Event, kind="no_claim"):
+
+class NoClaim(Event, kind="no_claim", level=Level.WARNING):
     """The board cannot reserve itself for one program."""
 
     message: str
 
 
-class Link(Event, kind="link"):
+class Link(
+    Event,
+    kind="link",
+    sentence="Link to the pump board: {message}",
+    opens=(Topic.LINK,),
+    closes=(Topic.LINK,),
+    delay_s=GLITCH_S,
+):
     """The link to the board failed or returned."""
 
     message: str
     up: bool
 
+    @property
+    def stands(self) -> bool:
+        """Whether it failed."""
+        return not self.up
 
-class InputsNotRecorded(Event, kind="inputs_not_recorded"):
+    @property
+    def level(self) -> Level:
+        """A failure is a warning."""
+        return Level.INFO if self.up else Level.WARNING
+
+
+class InputsNotRecorded(Event, kind="inputs_not_recorded", level=Level.WARNING):
     """Some ticks cannot be replayed."""
 
     message: str
 
 
-class ShapeUnreadable(Event, kind="shape_unreadable"):
+class ShapeUnreadable(Event, kind="shape_unreadable", level=Level.WARNING):
     """A message of the acquisition is unreadable."""
 
     message: str
 
 
-class LatchFailed(Event, kind="latch_failed"):
+class UnreadableEvent(Event, kind="unreadable_event", level=Level.ERROR):
+    """A message that is no event."""
+
+    message: str
+
+
+class LatchFailed(
+    Event,
+    kind="latch_failed",
+    sentence="The latched fault is not on the disk: {message}. Do: mend the disk; until then the next start would "
+    "not see the fault",
+    level=Level.ERROR,
+    opens=(Topic.LATCH,),
+    severity="critical",
+):
     """The latched fault's file could not be written."""
 
     message: str
 
 
-class LockNotStored(Event, kind="lock_not_stored"):
+class LatchWritten(
+    Event, kind="latch_written", sentence="The latched fault's file is written again", closes=(Topic.LATCH,)
+):
+    """The latched fault's file is written again."""
+
+
+class LockNotStored(
+    Event,
+    kind="lock_not_stored",
+    sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then only this run knows the lock",
+    level=Level.ERROR,
+    opens=(Topic.LOCK_STORAGE,),
+    subject="word",
+    severity="critical",
+):
     """A lock, or its removal, is not on the disk."""
 
     word: str
     message: str
 
 
-class LockStored(Event, kind="lock_stored"):
-    """A lock, or its removal, that had failed is on the disk now."""
+class LockStored(
+    Event, kind="lock_stored", sentence="The lock {word} is stored", closes=(Topic.LOCK_STORAGE,), subject="word"
+):
+    """A lock, or its removal, that had failed is on the disk."""
 
     word: str
-
-
-class LatchWritten(Event, kind="latch_written"):
-    """The latched fault's file is written again."""
 
 
 # Child processes.
 
 
-class Alive(Event, kind="alive"):
+class Alive(Event, kind="alive", sentence="Alive for {for_s:g} s"):
     """A child's sign of life; sent only on its pipe."""
 
     for_s: float
 
 
-class ChildEnded(Event, kind="child_ended"):
+class ChildEnded(
+    Event,
+    kind="child_ended",
+    sentence="The {child} process ended[ with exit code {exit_code}]; the hold continues",
+    level=Level.WARNING,
+    opens=(Topic.CHILD,),
+    subject="child",
+    delay_s=GLITCH_S,
+):
     """A child process has ended."""
 
     child: str
     exit_code: int | None
 
 
-class ChildSilent(Event, kind="child_silent"):
+class ChildSilent(
+    Event,
+    kind="child_silent",
+    sentence="The {child} process does not answer; the hold continues",
+    level=Level.WARNING,
+    opens=(Topic.CHILD,),
+    subject="child",
+    delay_s=GLITCH_S,
+):
     """A child has not reported that it is alive."""
 
     child: str
@@ -98,14 +178,34 @@ class ChildSilent(Event, kind="child_silent"):
     killed: bool
 
 
-class ChildRestarted(Event, kind="child_restarted"):
+class ChildRestarted(
+    Event,
+    kind="child_restarted",
+    sentence="The {child} process was replaced (replacement {restarts})",
+    closes=(Topic.CHILD, Topic.RECORDING),
+    subject="child",
+):
     """A child was replaced."""
 
     child: str
     restarts: int
 
+    def notice_changes(self, standing: Notices) -> NoticeChanges:
+        """End the notice of the child; a new recorder reports again what fails, so end those of the former one."""
+        closed = [NoticeKey(Topic.CHILD, self.child)]
+        if self.child == RECORDER:
+            closed += [key for key in standing if key.topic is Topic.RECORDING]
+        return NoticeChanges(closed=tuple(closed))
 
-class ChildGivenUp(Event, kind="child_given_up"):
+
+class ChildGivenUp(
+    Event,
+    kind="child_given_up",
+    sentence="The {child} process ended too often and is not replaced for an hour. Do: check the run",
+    level=Level.ERROR,
+    opens=(Topic.CHILD,),
+    subject="child",
+):
     """A child has ended too often in an hour."""
 
     child: str
@@ -115,7 +215,7 @@ class ChildGivenUp(Event, kind="child_given_up"):
 # Acquisition.
 
 
-class AcquisitionState(Event, kind="acquisition"):
+class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[: {message}]"):
     """The acquisition's state, in words."""
 
     state: str
@@ -123,8 +223,23 @@ class AcquisitionState(Event, kind="acquisition"):
     cycle: int | None = None
     traceback: str | None = None
 
+    @property
+    def level(self) -> Level:
+        """A failure is an error; a camera that does not answer yet is a warning."""
+        return {"failed": Level.ERROR, "retrying": Level.WARNING}.get(self.state, Level.INFO)
 
-class GeometryInForce(Event, kind="geometry"):
+    @property
+    def notable(self) -> bool:
+        """Whether it differs from the usual state."""
+        return self.state != "running"
+
+
+class GeometryInForce(
+    Event,
+    kind="geometry",
+    sentence="Geometry {hash}[ from {file}][, calibrated {calibrated_utc}][; {message}]",
+    notable=True,
+):
     """The geometry that the cycles use."""
 
     hash: str
@@ -133,7 +248,12 @@ class GeometryInForce(Event, kind="geometry"):
     message: str
 
 
-class Capture(Event, kind="capture"):
+class Capture(
+    Event,
+    kind="capture",
+    sentence="Capture[ of cycle {cycle}][ in {set}][, {verdict}][: {reason}][. Failed: {failed}]",
+    notable=True,
+):
     """The result of `capture`: the set's folder, or the reason for its absence."""
 
     cycle: int | None = None
@@ -144,7 +264,7 @@ class Capture(Event, kind="capture"):
     failed: str | None = None
 
 
-class Vibrations(Event, kind="vibrations"):
+class Vibrations(Event, kind="vibrations", sentence="Vibrations of the mirror: {message}"):
     """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it was not heard."""
 
     frequency_hz: Any  # list of numbers and None
@@ -152,7 +272,7 @@ class Vibrations(Event, kind="vibrations"):
     message: str
 
 
-class FramesLeftOut(Event, kind="raw_frames"):
+class FramesLeftOut(Event, kind="raw_frames", level=Level.WARNING):
     """Frames around a fault are not kept."""
 
     left_out: int
@@ -161,22 +281,38 @@ class FramesLeftOut(Event, kind="raw_frames"):
 
 # Recorder.
 
+RECORDER = "recorder"  # its name as a child
 
-class RecorderError(Event, kind="recorder_error"):
+
+class RecorderError(
+    Event,
+    kind="recorder_error",
+    sentence="Not recorded: {message}. Do: check the disk and the folder of the run",
+    level=Level.ERROR,
+    opens=(Topic.RECORDING,),
+    subject="what",
+):
     """`what` cannot be recorded."""
 
     what: str
     message: str
 
 
-class DiskLow(Event, kind="disk_low"):
+class DiskLow(
+    Event,
+    kind="disk_low",
+    sentence="Disk almost full: {message}",
+    level=Level.WARNING,
+    opens=(Topic.RECORDING,),
+    subject="what",
+):
     """The disk is almost full."""
 
     what: str
     message: str
 
 
-class RecorderRecovered(Event, kind="recorder_recovered"):
+class RecorderRecovered(Event, kind="recorder_recovered", closes=(Topic.RECORDING,), subject="what"):
     """`what` works again."""
 
     what: str
@@ -190,7 +326,7 @@ class RunDeleted(Event, kind="run_deleted"):
     message: str
 
 
-class RecorderDone(Event, kind="recorder_done"):
+class RecorderDone(Event, kind="recorder_done", sentence="Recorder done"):
     """The recorder's summary; comes after the last line of the file."""
 
     dropped: Any
@@ -209,7 +345,7 @@ class RecorderDone(Event, kind="recorder_done"):
 # Control port and alarms.
 
 
-class PortAddresses(Event, kind="port"):
+class PortAddresses(Event, kind="port", sentence="Control port open[ on {socket}][, TLS {tls}][, metrics {metrics}]"):
     """Where the control port listens."""
 
     socket: str | None = None
@@ -217,29 +353,47 @@ class PortAddresses(Event, kind="port"):
     metrics: str | None = None
 
 
-class PortFailed(Event, kind="port_failed"):
+class PortFailed(
+    Event,
+    kind="port_failed",
+    sentence="Control port {port} failed: {message}[. Tries again in {again_s:g} s]",
+    level=Level.WARNING,
+    opens=(Topic.PORT,),
+    subject="port",
+    delay_s=GLITCH_S,
+):
     """A listener or one of its clients failed."""
 
     port: str
     message: str
     again_s: float | None = None
 
+    @property
+    def stands(self) -> bool:
+        """Whether the listener failed, which ends with `PortOpen`; a failed client is gone."""
+        return self.again_s is not None
 
-class PortOpen(Event, kind="port_open"):
+
+class PortOpen(
+    Event, kind="port_open", sentence="Control port {port} works again", closes=(Topic.PORT,), subject="port"
+):
     """The listener works again."""
 
     port: str
 
 
-class CommanderChanged(Event, kind="commander"):
+class CommanderChanged(Event, kind="commander", sentence="Control taken by {who}[ (previously {former})][: {why}]"):
     """Who has command now, and who had it before."""
 
     who: str | None
     former: str | None
     why: str
 
+    def _choose_template(self) -> str:
+        return self._template if self.who else "Control released[ by {former}][: {why}]"
 
-class Refused(Event, kind="refused"):
+
+class Refused(Event, kind="refused", sentence="Refused {command} of {who}: {reason}", level=Level.WARNING):
     """The port refused a request, and perhaps others not recorded."""
 
     who: str
@@ -249,14 +403,16 @@ class Refused(Event, kind="refused"):
     and_unrecorded: int | None = None
 
 
-class AlarmsAcknowledged(Event, kind="alarms_acknowledged"):
+class AlarmsAcknowledged(
+    Event, kind="alarms_acknowledged", sentence="Alarms acknowledged by {who}[: {why}]", notable=True
+):
     """Somebody acknowledged all alarms."""
 
     who: str
     why: str
 
 
-class AlarmTold(Event, kind="alarm"):
+class AlarmTold(Event, kind="alarm", sentence="Alarm {alarm}[ to {to}]: {text}"):
     """An alarm's notice was sent, or failed."""
 
     alarm: str
@@ -271,31 +427,17 @@ class AlarmTold(Event, kind="alarm"):
 # People, during the run or after it.
 
 
-class Mark(Event, kind="mark"):
+class Mark(Event, kind="mark", sentence="Mark[ by {who}]: {text}", notable=True):
     """A remark on a moment of the run."""
 
     text: str
     who: str
     made_utc: str | None = None  # after the run
 
-
-CONNECTED_AGAIN = "connected again"
-_EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
-
-
-class UnknownEvent(Event):
-    """An event of an unknown kind, or with unexpected fields."""
-
-    line: EventLine
-
     @property
-    def kind(self) -> str:
-        """Kind as in the line; "?" if missing."""
-        return str(self.line.get("kind", "?"))
-
-    def to_dict(self) -> EventLine:
-        """The line, unchanged."""
-        return dict(self.line)
+    def plot_mark(self) -> str:
+        """A line of marks."""
+        return "mark"
 
 
 def parse(message: bytes) -> EventLine:
@@ -304,7 +446,7 @@ def parse(message: bytes) -> EventLine:
         event = json.loads(message)
     except (ValueError, RecursionError):
         event = None
-    return event if isinstance(event, dict) else {"kind": "unreadable_event", "message": repr(message[:200])}
+    return event if isinstance(event, dict) else UnreadableEvent(repr(message[:200])).to_dict()
 
 
 def from_dict(line: EventLine) -> Event:

@@ -13,15 +13,14 @@ from rerun.blueprint.encodings import TimelineColumn
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import columns
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
-from membrane_ctrl.model.events import for_people
-from membrane_ctrl.model.telemetry import RunStatus, gains_words
+from membrane_ctrl.model.prose import for_people
+from membrane_ctrl.model.run_status import RunStatus, gains_words
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS
 from membrane_ctrl.run_files import shapes, streams
 
 SUMMARY_PATH = "/summary"
 # Each page is 0.7 kB. In the first minutes somebody is watching.
 SUMMARY_INTERVAL_S, SUMMARY_EARLY_INTERVAL_S, SUMMARY_EARLY_S = 60.0, 10.0, 300.0
-SUMMARY_AT_ONCE = frozenset({"state", "fault", "cleared", "command", "end"})
 
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
@@ -292,7 +291,7 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
         "geometry": _geometry(summary["geometry"]),
         "gains": gains_words(status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]),
         "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
-        "not recorded": status.recording_words,
+        "not recorded": "; ".join(status.recording_problems),
     }
     state = states[-1]["state"] if states else "not started"
     lines = [f"| {name} | {_cell(words)} |" for name, words in rows.items() if words]

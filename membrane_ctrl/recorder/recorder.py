@@ -9,9 +9,10 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.events import Event, EventLine
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
 from membrane_ctrl.run_files import run_folder, tables
@@ -153,7 +154,7 @@ class Recorder:
         self._events_file = sink.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
-        self._status = telemetry.RunStatus()
+        self._status = RunStatus()
         for told in run_folder.read_events(run_dir, []) if resumes else ():
             self._status = self._status.after_event(told.event, told.mono_s)
         self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
@@ -177,16 +178,17 @@ class Recorder:
 
     def take_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""
-        for event in new:
-            self._summary.add_event(event)
-            self._errors.guarded("status", partial(self._follow, event))
-            self.urgent |= event.get("kind") in sink.URGENT
-            self.ended |= event.get("kind") == "end"
+        for line in new:
+            event = run_events.from_dict(line)
+            self._summary.add_event(line)
+            self._errors.guarded("status", partial(self._follow, event, float(line.get("mono_s") or 0.0)))
+            self.urgent |= event.urgent
+            self.ended |= isinstance(event, run_events.Ended)
         self._events += new
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
 
-    def _follow(self, event: EventLine) -> None:
-        self._status = self._status.after_event(run_events.from_dict(event), float(event.get("mono_s") or 0.0))
+    def _follow(self, event: Event, mono_s: float) -> None:
+        self._status = self._status.after_event(event, mono_s)
 
     def _take_shape(self, message: bytes) -> None:
         estimate = shape_estimate.unpack_estimate(message)

@@ -8,6 +8,7 @@ from typing import Protocol
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.recorder import blueprint, rerun_streams, sink
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 
@@ -99,9 +100,7 @@ class RerunOutput:
             self._thumbnails.send(now_s)
 
     def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
-        if now_s < self._next_summary_s and not any(
-            event.get("kind") in blueprint.SUMMARY_AT_ONCE for event in events
-        ):
+        if now_s < self._next_summary_s and not any(from_dict(event).notable for event in events):
             return
         early = now_s < blueprint.SUMMARY_EARLY_S
         self._next_summary_s = now_s + (blueprint.SUMMARY_EARLY_INTERVAL_S if early else blueprint.SUMMARY_INTERVAL_S)

@@ -11,7 +11,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 from membrane_ctrl.model.columns import COLUMNS, Kind
-from membrane_ctrl.model.events import EventLine, for_people, level, sentence
+from membrane_ctrl.model.events import EventLine, PumpLearned
+from membrane_ctrl.model.prose import for_people
+from membrane_ctrl.model.run_events import Vibrations, from_dict
 from membrane_ctrl.recorder import blueprint, sink
 from membrane_ctrl.run_files import shapes, streams
 
@@ -25,21 +27,23 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
     """Send events in order: a sentence each, and vertical lines across plots."""
     if not events:
         return
-    time_s = np.array([float(event.get("mono_s") or 0.0) for event in events])
+    timed = [(float(line.get("mono_s") or 0.0), from_dict(line)) for line in events]
+    time_s = np.array([at_s for at_s, _ in timed])
     # the log's own column of times is too narrow to read
-    texts = [f"{str(event.get('time_utc', ''))[11:19]} {sentence(event)}".strip() for event in events]
-    levels = [level(event) for event in events]
+    clock_times = [str(line.get("time_utc", ""))[11:19] for line in events]
+    texts = [f"{clock} {event.sentence}".strip() for clock, (_, event) in zip(clock_times, timed, strict=True)]
+    levels = [event.level.value for _, event in timed]
     recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
-    for stream, marks_s, values in streams.mark_lines(events):
+    for stream, marks_s, values in streams.mark_lines(timed):
         recording.scalars(stream.path, marks_s, values)
-    of_pump = [(at_s, event) for at_s, event in zip(time_s, events, strict=True) if event.get("kind") == "pump"]
+    of_pump = [(at_s, event) for at_s, event in timed if isinstance(event, PumpLearned)]
     if of_pump:
-        values = np.array([[event["scale"], event["correction"]] for _, event in of_pump])
-        squares = np.array([[event["sigma"] ** 2, 0.0] for _, event in of_pump])
+        values = np.array([[event.scale, event.correction] for _, event in of_pump])
+        squares = np.array([[event.sigma**2, 0.0] for _, event in of_pump])
         recording.measurements(streams.PUMP.path, np.array([at_s for at_s, _ in of_pump]), values, squares)
-    for at_s, event in zip(time_s, events, strict=True):
-        if event.get("kind") == "vibrations":
-            heard = [math.nan if value is None else value for value in event["frequency_hz"]]
+    for at_s, event in timed:
+        if isinstance(event, Vibrations):
+            heard = [math.nan if value is None else value for value in event.frequency_hz]
             most = len(streams.VIBRATIONS.lines)
             values = np.array([(heard + most * [math.nan])[:most]])
             recording.scalars(streams.VIBRATIONS.path, np.array([at_s]), values)

@@ -28,7 +28,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.files import sync_data
 from membrane_ctrl.model.plain_json import dumps_checked
-from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered
+from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered, from_dict
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
 from membrane_ctrl.run_files import segments, shapes, streams
@@ -250,8 +250,6 @@ class RecorderErrors:
             self.recovered(what)
 
 
-# What is on the disk at once: a power cut may follow.
-URGENT = frozenset({"fault", "end"})
 # Events that wait while the disk is full; a fault campaign makes a few hundred.
 _WAITING_MAX = 10_000
 
@@ -286,7 +284,7 @@ class EventsFile:
             if line in self._written:
                 continue
             self._waiting.append(line)
-            self._sync |= event.get("kind") in URGENT
+            self._sync |= from_dict(event).urgent
         while len(self._waiting) > _WAITING_MAX:
             # the first line may already be half written: keep it, drop the second
             del self._waiting[1]

@@ -30,7 +30,7 @@ from membrane_ctrl.model.columns import (
     columns_of,
     plots_of,
 )
-from membrane_ctrl.model.events import EventLine
+from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import Rows, column
 from membrane_ctrl.model.zernike_terms import zernike_labels
 
@@ -143,10 +143,13 @@ MARKS: tuple[Stream, ...] = (
 _MARK_HALF_HEIGHT = 1e3  # in the units of any plot that has them
 
 
-def mark_lines(events: Sequence[EventLine]) -> Iterator[tuple[Stream, Column, FloatArray]]:
-    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical line for each."""
+def mark_lines(events: Sequence[tuple[float, Event]]) -> Iterator[tuple[Stream, Column, FloatArray]]:
+    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical line for each.
+
+    `events` are those of a run with their times.
+    """
     for stream in MARKS:
-        found = [float(event.get("mono_s") or 0.0) for event in events if _mark_kind(event) == stream.lines[0].field]
+        found = [mono_s for mono_s, event in events if event.plot_mark == stream.lines[0].field]
         if found:
             yield stream, *vertical_lines(np.array(found))
 
@@ -155,15 +158,6 @@ def vertical_lines(time_s: Column) -> tuple[Column, FloatArray]:
     """Times (3 n,) and values (3 n, 1) that draw a vertical line at each of n times."""
     values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], time_s.size)
     return (time_s[:, np.newaxis] + [0.0, 0.0, 1e-9]).ravel(), values[:, np.newaxis]
-
-
-def _mark_kind(event: EventLine) -> str:
-    if event.get("kind") != "command":
-        return str(event["kind"]) if event.get("kind") in ("fault", "mark") else ""
-    command = str(event.get("command"))
-    if event.get("refused"):
-        return ""
-    return {"setpoint": "setpoint", "pause": "pause", "resume": "pause", "mark": "mark"}.get(command, "command")
 
 
 def overview_um(rows: Rows) -> FloatArray:

@@ -206,19 +206,20 @@ class Summary:
         leak = leak[np.isfinite(leak)]
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
 
-    def add_event(self, event: EventLine) -> None:
-        """Add one event; only those of faults and states, "geometry" and "end" matter."""
-        if event.get("kind") in ("fault", "cleared", "state"):
-            standing = standing_fault_after(self._standing_fault(), run_events.from_dict(event))
-            self._standing = [] if standing is None else [standing.to_dict()]
-        if event.get("kind") == "fault":
-            self._fault_count += 1
-            if len(self._faults) < _LISTED_MAX:
-                self._faults.append(event)
-        elif event.get("kind") == "geometry":
-            self._geometry = {key: event.get(key) for key in ("hash", "file", "calibrated_utc")}
-        elif event.get("kind") == "end":
-            self._end = event
+    def add_event(self, line: EventLine) -> None:
+        """Add one event; only those of faults and states, the geometry and the end of the run matter."""
+        event = run_events.from_dict(line)
+        standing = standing_fault_after(self._standing_fault(), event)
+        self._standing = [] if standing is None else [standing.to_dict()]
+        match event:
+            case events.Fault():
+                self._fault_count += 1
+                if len(self._faults) < _LISTED_MAX:
+                    self._faults.append(line)
+            case run_events.GeometryInForce():
+                self._geometry = {key: line.get(key) for key in ("hash", "file", "calibrated_utc")}
+            case run_events.Ended():
+                self._end = line
 
     def _standing_fault(self) -> events.Fault | None:
         for line in self._standing:

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.console.model import event_words
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.ctl import Where, connected
 from membrane_ctrl.model import errors, shape_estimate, telemetry
@@ -199,8 +198,9 @@ class HoldFeed:
     def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:
         if "event" in message:
             utc = datetime.now(UTC)
-            self._events.append(f"{utc:%H:%M:%S} UTC  {event_words(message['event'])}")
-            if isinstance(event := logged(message["event"]).event, Mark):
+            event = logged(message["event"]).event
+            self._events.append(f"{utc:%H:%M:%S} UTC  {event.sentence}")
+            if isinstance(event, Mark):
                 self.marks.append((utc.timestamp(), event.text))
         if "status" in message:
             self.seen = replace(

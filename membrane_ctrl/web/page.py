@@ -10,21 +10,12 @@ from urllib.parse import urlencode
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.ctl import lock_lines
+from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
 from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history, marks
-from membrane_ctrl.web.panels import (
-    CHOOSES,
-    SessionWatch,
-    TuningPanel,
-    alarms_of,
-    fleet_panel,
-    fresh,
-    runs_panel,
-    tell,
-)
+from membrane_ctrl.web.panels import CHOOSES, SessionWatch, TuningPanel, fleet_panel, fresh, runs_panel, tell
 from membrane_ctrl.web.work_pools import FIGURES, LIVE_CHARTS, LONG_CHARTS, SESSIONS, PoolFullError, pool_of_command
 
 _LOOK_S = 1.0
@@ -229,7 +220,7 @@ class WebPage:
             self._coloured = colour
             self._state.props(f"color={colour} text-color={'white' if colour == 'negative' else 'black'}")
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
-        self._alarm.set_text(alarms_of(status))
+        self._alarm.set_text("; ".join(alarm_lines(status)))
         for column in PUBLISHED:
             value = None if silent else row.get(column.name)
             self._numbers[column.name].set_text(column.format_value(value))

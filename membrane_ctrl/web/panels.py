@@ -9,12 +9,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import quote
 
 from nicegui import ui
 
-from membrane_ctrl.control_port.ctl import lock_lines
+from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.review import catalogue
@@ -44,16 +44,6 @@ def tell(text: str, good: bool | None = None) -> None:
     ui.notify(text, type=kind, position="top", timeout=5000 if good is None else 8000)
 
 
-def alarms_of(status: Mapping[str, Any]) -> str:
-    """The locks, the fault, the open interlocks, the notices and what the recording lacks, in one line."""
-    fault = status.get("fault")
-    lines = [f"LOCKED {line}" for line in lock_lines(status)]
-    lines += [f"FAULT {fault['code']} {fault['name']}: {fault['cause']}; {fault['remedy']}"] if fault else []
-    parts = ("interlocks", "maintenance", "recording")
-    lines += [str(each) for part in parts for each in status.get(part, {}).values()]
-    return "; ".join(lines)
-
-
 def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
     """A row of the fleet's table for each hold."""
     rows: list[dict[str, object]] = []
@@ -63,7 +53,7 @@ def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
             rows.append({"hold": name, "state": "no contact", "error": None, "says": seen.silent})
             continue
         error_um = (seen.status.get("row") or {}).get("error_um")
-        says = alarms_of(seen.status) or seen.status.get("why") or "as it should be"
+        says = "; ".join(alarm_lines(seen.status)) or seen.status.get("why") or "as it should be"
         error = None if error_um is None else round(error_um, 2)
         rows.append({"hold": name, "state": seen.status.get("state"), "error": error, "says": says})
     return rows

@@ -10,8 +10,11 @@ from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, signs_of
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.run_events import ChildRestarted, DiskLow
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.recorder.sink import RecorderErrors
 
+LOW = "Disk almost full: less than 500 MB free"
+NOT_RECORDED = "Not recorded: state file: x. Do: check the disk and the folder of the run"
 CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=30)
 BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)
 
@@ -120,10 +123,12 @@ class Disk:
         self.book = AlarmBook(CONFIG)
         self.recorder_errors = RecorderErrors(self.hear)
         self.now_s = 0.0
+        self.status = RunStatus()
 
     def hear(self, event: Event) -> None:
-        for sign in signs_of(event):
+        for sign in signs_of(event.notice_changes(self.status.notices)):
             self.book.take(sign, self.now_s)
+        self.status = self.status.after_event(event)
 
     def step(self, now_s: float) -> list[tuple[str, str]]:
         self.now_s = now_s
@@ -133,16 +138,16 @@ class Disk:
 def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_first() -> None:
     disk = Disk()
     disk.recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
-    assert disk.step(0.0) == [("raised", "less than 500 MB free")]
+    assert disk.step(0.0) == [("raised", LOW)]
     disk.step(5.0)
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(6.0)
     disk.recorder_errors.recovered("state file")
     assert disk.step(37.0) == []
     assert disk.book.standing("recorder")
-    assert disk.step(910.0) == [("escalated", "less than 500 MB free")]
+    assert disk.step(910.0) == [("escalated", LOW)]
     disk.recorder_errors.recovered("disk")
-    assert disk.step(940.0) == [("cleared", "less than 500 MB free")]
+    assert disk.step(940.0) == [("cleared", LOW)]
 
 
 def test_a_reminder_names_what_still_stands() -> None:
@@ -151,7 +156,7 @@ def test_a_reminder_names_what_still_stands() -> None:
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
     disk.recorder_errors.recovered("disk")
-    assert disk.step(900.0) == [("escalated", "state file: x")]
+    assert disk.step(900.0) == [("escalated", NOT_RECORDED)]
 
 
 def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own() -> None:
@@ -163,4 +168,4 @@ def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own()
     assert not disk.book.standing("recorder")
     RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", DiskLow)
     assert disk.step(40.0) == [], "the same alarm, not told off and told again"
-    assert disk.step(900.0) == [("escalated", "less than 500 MB free")]
+    assert disk.step(900.0) == [("escalated", LOW)]

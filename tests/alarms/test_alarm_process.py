@@ -69,7 +69,7 @@ def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
         ("glitch", "warning"),
         ("fault", "critical"),
     ]
-    assert sender.through[1].text.startswith("displacement_missing")
+    assert sender.through[1].text.startswith("Fault displacement_missing")
 
 
 def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
@@ -84,7 +84,7 @@ def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement()
     watcher.look([ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0)
     watcher.look([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
     assert told(sender) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
-    assert sender.through[-1].text.startswith("over_pressure")
+    assert sender.through[-1].text.startswith("Fault over_pressure")
 
 
 def test_a_fault_is_told_at_once_and_its_end_too() -> None:

@@ -11,14 +11,19 @@ from membrane_ctrl import alarms
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film_health
 from membrane_ctrl.metrology.track import live
+from membrane_ctrl.model import run_events
+from membrane_ctrl.model.event_base import KINDS
+from membrane_ctrl.model.notices import NoticeKey, Topic
 
 RUNBOOK = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
 SOURCES = "".join(path.read_text(encoding="utf-8") for path in Path(*alarms.__path__).glob("*.py"))
-PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES))
+BY_SUBJECT = {Topic.CHILD, Topic.MAINTENANCE}  # named by their subjects
+OF_EVENTS = {NoticeKey(topic).alarm for cls in KINDS.values() for topic in cls.opens if topic not in BY_SUBJECT}
+PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES)) | OF_EVENTS
 MAINTENANCE = re.findall(r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE)
 VIBRATIONS = re.findall(r'_notice\("(\w+)"', Path(live.__file__).read_text(encoding="utf-8"))
 RULES = [rule.name for rule in Config().alarms.rules]
-CHILDREN = [f"{child}_ended" for child in ("recorder", "acquisition", "screen")]
+CHILDREN = [NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")]
 
 
 def test_the_names_are_found() -> None:

@@ -9,7 +9,9 @@ import pytest
 from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, text
+from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, fault_words
+from membrane_ctrl.model.events import Fault
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, SafeLevel, ShapeState, State
 
 
@@ -154,14 +156,16 @@ def test_end_event_ends() -> None:
     ("given", "words"),
     [
         (FAULT, "link lost: the link to the pump board is down (link down)"),
-        ({"why": "because"}, "because"),
-        ({"reason": "because", "message": "not this"}, "because"),
         ({"name": "late"}, "late"),
-        ({"exit": 0}, ""),
+        ({"cause": "because"}, "because"),
+        ({}, "unnamed"),
     ],
 )
-def test_words_of_an_event(given: dict[str, object], words: str) -> None:
-    assert text(given) == words
+def test_words_of_a_fault(given: dict[str, object], words: str) -> None:
+    fault = from_dict({"kind": "fault", **given})
+    assert isinstance(fault, Fault)
+    assert fault_words(fault) == words
+    assert fault_words(None) == ""
 
 
 def test_gains_in_force_and_the_countdown_of_a_trial_are_shown() -> None:

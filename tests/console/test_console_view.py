@@ -12,9 +12,10 @@ from rich.console import Console
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel, event_line
-from membrane_ctrl.console.process import at_once, line
+from membrane_ctrl.console.process import line
 from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import duration, number, percent
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State
 
 CONFIG = Config()
@@ -118,8 +119,8 @@ def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> 
     model.take_event(event(70.0, "command", command="hold", who="unix:tom", why="", refused="not now"))
     model.take_event(event(70.0, "why", why="only the headline says this"))
     page = "\n".join(drawn(model, width=100, height=40))
-    assert "03:12:00  COMMAND setpoint step 69, by unix:ann" in page
-    assert "COMMAND hold, by unix:tom; refused: not now" in page
+    assert "03:12:00  Command setpoint by unix:ann: step 69" in page
+    assert "Command hold by unix:tom. Refused: not now" in page
     assert "step 20" not in page
     assert "only the headline" not in page
 
@@ -175,11 +176,22 @@ def test_fault_and_its_remedy_are_seen() -> None:
 def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
     model = held()
     model.take_event(event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs"))
-    assert any("recorder less than 500 MB free; delete old runs" in row for row in drawn(model))
-    assert line(model.view(75.0)).count("RECORDING less than 500 MB free; delete old runs") == 1
+    low = "Disk almost full: less than 500 MB free; delete old runs"
+    assert any(f"notice {low}" in " ".join(row.split()) for row in drawn(model))
+    assert line(model.view(75.0)).count(low) == 1
     model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
-    assert not any("recorder" in row for row in drawn(model))
-    assert "RECORDING" not in line(model.view(75.0))
+    assert not any("notice" in row for row in drawn(model))
+    assert "500 MB" not in line(model.view(75.0))
+
+
+def test_of_many_notices_the_first_are_shown() -> None:
+    model = held()
+    for nth in range(5):
+        model.take_event(event(75.0, "recorder_error", what=f"file {nth}", message=f"file {nth} failed"))
+    shown = [" ".join(row.split()) for row in drawn(model) if "notice" in row]
+    assert len(shown) == 4
+    assert "Not recorded: file 0 failed" in shown[0]
+    assert "and 2 more" in shown[3]
 
 
 def test_silence_is_the_headline() -> None:
@@ -207,21 +219,22 @@ def test_plain_line_has_the_second_in_it() -> None:
 
 def test_plain_events() -> None:
     assert event_line(event(12.345, "fault", **FAULT)) == (
-        "     12.3 s  FAULT link lost: the link to the pump board is down (link down); "
-        "check cable, power and address; the board's watchdog has stopped the pump"
+        "     12.3 s  Fault link_lost: the link to the pump board is down (link down). Do: check cable, power and "
+        "address; the board's watchdog has stopped the pump. Limit: must be up; safe level pump_off"
     )
-    assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  STATE hold settled"
-    assert event_line({"kind": "end", "exit": 5}) == "        – s  END 5"
-    assert event_line(event(1.0, "recorder_error", message="a\n  b")) == "      1.0 s  RECORDER_ERROR a b"
+    assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  State hold: settled"
+    assert event_line({"kind": "end", "exit": "done"}) == "        – s  Run ended: done"
+    assert event_line({"kind": "end", "exit": 5}) == "        – s  end: exit 5"
+    assert event_line(event(1.0, "raw_frames", message="a\n  b")) == "      1.0 s  A b"
 
 
 def test_what_cannot_wait_a_second() -> None:
-    kinds = ("fault", "cleared", "state", "link", "child_ended", "end")
-    kinds += ("recorder_error", "disk_low", "recorder_recovered")
-    assert all(at_once({"kind": kind}) for kind in kinds)
-    assert not any(at_once({"kind": kind}) for kind in ("why", "shape", "command", "start"))
-    assert at_once({"kind": "acquisition", "state": "retrying"})
-    assert not at_once({"kind": "acquisition", "state": "running"})
+    kinds = ("fault", "cleared", "state", "link", "child_ended", "end", "command", "start")
+    kinds += ("recorder_error", "disk_low", "recorder_recovered", "interlock_opened", "interlock_closed")
+    assert all(from_dict({"kind": kind}).notable for kind in kinds)
+    assert not any(from_dict({"kind": kind}).notable for kind in ("why", "shape", "held_by", "pump", "vibrations"))
+    assert from_dict({"kind": "acquisition", "state": "retrying"}).notable
+    assert not from_dict({"kind": "acquisition", "state": "running"}).notable
 
 
 def test_bars_stand_and_hang() -> None:

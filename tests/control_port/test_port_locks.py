@@ -14,13 +14,13 @@ import pytest
 from port_run import LineClient, PortRun, client, port_run
 
 from membrane_ctrl.control_port import server
-from membrane_ctrl.control_port.ctl import fleet_line, lock_lines, status_lines
+from membrane_ctrl.control_port.ctl import fleet_line, status_lines
 from membrane_ctrl.control_port.protocol import OnBehalf, Peer, parse, sender_of
-from membrane_ctrl.control_port.server import status_table
+from membrane_ctrl.control_port.status import lock_lines, status_table
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.events import LockRemoved, LockSet
 from membrane_ctrl.model.run_events import LockNotStored, LockStored
-from membrane_ctrl.model.telemetry import RunStatus
+from membrane_ctrl.model.run_status import RunStatus
 
 HOLD = Peer("unix:membrane", "tune", 1, is_own_user=True)
 ANN = Peer("unix:ann", "operate", 2)

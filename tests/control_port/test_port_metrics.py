@@ -11,7 +11,9 @@ from port_run import ROW, port_run
 
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port.server import metrics_text
-from membrane_ctrl.model.telemetry import FIELDS, RunStatus
+from membrane_ctrl.model.run_events import DiskLow
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import FIELDS
 
 SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 
@@ -34,8 +36,9 @@ def test_before_the_first_tick_there_are_the_ports_own() -> None:
 
 
 def test_trouble_with_the_recording_is_a_gauge() -> None:
+    failing = RunStatus().after_event(DiskLow("disk", "full"))
     assert "membrane_recording_ok 1.0" in metrics_text(RunStatus(), 0, 0).splitlines()
-    assert "membrane_recording_ok 0.0" in metrics_text(RunStatus(recording={"disk": "full"}), 0, 0).splitlines()
+    assert "membrane_recording_ok 0.0" in metrics_text(failing, 0, 0).splitlines()
 
 
 async def fetch(port: int, request: bytes) -> bytes:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.run_events import ChildEnded, ChildGivenUp, ChildRestarted, DiskLow, RecorderError
-from membrane_ctrl.model.telemetry import RunStatus
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.recorder.sink import RecorderErrors
 
 
@@ -17,7 +17,7 @@ class Trouble:
 
     @property
     def words(self) -> str:
-        return self.status.recording_words
+        return "; ".join(self.status.recording_problems)
 
 
 def test_each_trouble_stands_until_its_own_end() -> None:
@@ -27,22 +27,24 @@ def test_each_trouble_stands_until_its_own_end() -> None:
     recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
     recorder_errors.report_error("state file", "state file: x")
     recorder_errors.report_error("state file", "state file:\n  y")
-    assert trouble.words == "less than 500 MB free; state file: y"
+    low = "Disk almost full: less than 500 MB free"
+    failed = "Not recorded: state file: y. Do: check the disk and the folder of the run"
+    assert trouble.words == f"{low}; {failed}"
     recorder_errors.recovered("state file")
-    assert trouble.words == "less than 500 MB free"
+    assert trouble.words == low
     recorder_errors.recovered("disk")
     assert trouble.words == ""
     recorder_errors.report_error("recording", "x" * 5000)
-    assert trouble.words == "x" * 300, "it is in every line of the log"
+    assert trouble.words == f"Not recorded: {'x' * 286}", "it is in every line of the log"
 
 
 def test_without_a_recorder_nothing_is_recorded_and_the_next_one_tells_its_own_trouble() -> None:
     trouble = Trouble()
     trouble.take(RecorderError("state file", "state file: x"))
     trouble.take(ChildEnded("screen", 1))
-    assert "recorder" not in trouble.status.recording
+    assert "screen" not in trouble.words
     trouble.take(ChildEnded("recorder", -9))
-    assert trouble.status.recording["recorder"] == "no recorder runs"
+    assert "The recorder process ended with exit code -9; the hold continues" in trouble.words
     trouble.take(ChildRestarted("screen", 1))
     assert trouble.words
     trouble.take(ChildRestarted("recorder", 1))
@@ -52,4 +54,4 @@ def test_without_a_recorder_nothing_is_recorded_and_the_next_one_tells_its_own_t
 def test_a_recorder_that_is_left_alone_for_an_hour_stays_in_sight() -> None:
     trouble = Trouble()
     trouble.take(ChildGivenUp("recorder", 10))
-    assert trouble.words == "no recorder runs"
+    assert trouble.words.startswith("The recorder process ended too often")

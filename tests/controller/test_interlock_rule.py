@@ -18,7 +18,8 @@ from membrane_ctrl.controller.tick import TickAssembler, output_crc, pack_tick, 
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, InterlockClosed, InterlockOpened, Resumed, Why
-from membrane_ctrl.model.telemetry import RunStatus, SafeLevel, State
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks

@@ -22,7 +22,8 @@ from membrane_ctrl.controller.tick import (
 )
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
 from membrane_ctrl.model.lock import LOCKS_MOST, WORDS, Lock, describe_locks, distinct_word, word_of_number
-from membrane_ctrl.model.telemetry import RunStatus, State
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import State
 
 ANN = Lock("bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00")
 BOB = Lock("gumil", "lens off", "page:bob", "page:bob", "page 1f", "2026-01-02T03:05:05+00:00")

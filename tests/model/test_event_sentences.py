@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import pytest
 
-from membrane_ctrl.model import events
-from membrane_ctrl.model.events import KINDS, EventLine, level, sentence
+from membrane_ctrl.model import prose
+from membrane_ctrl.model.event_base import KINDS, Event, EventLine
+from membrane_ctrl.model.run_events import from_dict
 
 FAULT = {
     "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 um",
@@ -17,7 +16,7 @@ FAULT = {
 
 
 def test_a_fault_says_what_where_and_what_to_do() -> None:
-    assert sentence(FAULT) == (
+    assert from_dict(FAULT).sentence == (
         "Fault over_displacement: the bowl is deeper than its limit (501.0 µm). Do: check the laser against a ruler. "
         "Limit: limits.displacement_max_um; safe level vent"
     )
@@ -54,19 +53,14 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
     ],
 )
 def test_an_event_is_a_sentence(line: EventLine, said: str) -> None:
-    assert sentence(line) == said
+    assert from_dict(line).sentence == said
 
 
-def test_every_sentence_is_of_a_kind_and_uses_its_keys() -> None:
-    for kind, form in events._SENTENCES.items():
-        known = KINDS["plausibility" if kind == "agreement" else kind]
-        keys = {key for _, key in known.keys} | {"unit"}
-        assert set(events._FIELD.findall(form)) <= keys, kind
-
-
-def test_every_kind_without_a_sentence_has_a_message() -> None:
-    silent = {kind for kind, cls in KINDS.items() if "message" not in {field.name for field in fields(cls)}}
-    assert silent - set(events._SENTENCES) <= {"alive", "recorder_done"}  # never in a run's events
+@pytest.mark.parametrize("cls", KINDS.values(), ids=KINDS)
+def test_every_sentence_uses_the_fields_and_properties_of_its_event(cls: type[Event]) -> None:
+    keys = {key for _, key in cls.keys}
+    for name in prose.fields_of(cls._template):
+        assert name in keys or isinstance(getattr(cls, name, None), property), name
 
 
 @pytest.mark.parametrize(
@@ -84,4 +78,4 @@ def test_every_kind_without_a_sentence_has_a_message() -> None:
     ],
 )
 def test_levels(line: EventLine, expected: str) -> None:
-    assert level(line) == expected
+    assert from_dict(line).level == expected

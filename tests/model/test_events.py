@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.model.events import KINDS, CommandTaken, Event, Fault, StateEntered
-from membrane_ctrl.model.run_events import Capture, CommanderChanged, Link, UnknownEvent, from_dict
+from membrane_ctrl.model.event_base import KINDS, Event, UnknownEvent
+from membrane_ctrl.model.events import CommandTaken, Fault, StateEntered
+from membrane_ctrl.model.run_events import Capture, CommanderChanged, Link, from_dict
 
 
 def test_keys_stay_in_the_order_of_the_format() -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl.model.event_base import UnknownEvent
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import Mark, UnknownEvent, parse
+from membrane_ctrl.model.run_events import Mark, parse
 from membrane_ctrl.recorder import sink
 from membrane_ctrl.recorder.sink import EventsFile
 from membrane_ctrl.run_files.run_folder import logged

@@ -6,7 +6,8 @@ import numpy as np
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.telemetry import RunStatus, unpack
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.blueprint import summary_page
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.synthetic_run import rows_of, shape_of

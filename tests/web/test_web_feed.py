@@ -11,11 +11,11 @@ import pytest
 
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.control_port.protocol import encode, parse
+from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
 from membrane_ctrl.web.feed import HoldFeed
-from membrane_ctrl.web.panels import alarms_of
 from tests.control_port.port_run import ROW, port_run
 
 _LOOK_S = 0.02
@@ -92,10 +92,10 @@ def test_what_the_page_states_of_a_viewer_is_read_by_the_port_and_a_link_is_no_a
 def test_locks_come_first_among_the_alarms() -> None:
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
     fault = {"code": 51, "name": "locked", "cause": "a lock", "remedy": "ask"}
-    shown = alarms_of({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault})
+    shown = alarm_lines({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault})
     assert shown.startswith('LOCKED "hands inside" by unix:ann, 2026-01-02, word bofak; LOCKED')
     assert "gumil" in shown
-    assert alarms_of({"locks": [], "fault": None}) == ""
+    assert alarm_lines({"locks": [], "fault": None}) == ""
 
 
 @pytest.mark.parametrize(

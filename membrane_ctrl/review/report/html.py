@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from membrane_ctrl import __version__
 from membrane_ctrl.model import errors, files, plain_json
@@ -53,7 +52,6 @@ footer{margin-top:30px;color:#889;font-size:12px}
 # A month has thousands of lines; the JSON report has them all.
 _LINES_MOST = 200
 READING, TRUE = "reading (in the loop)", "true centre (twin)"
-_HIDDEN = {"time_utc", "mono_s", "kind", "exit_code", "made_utc"}
 
 
 def render(
@@ -241,16 +239,10 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare
 def _timeline(analysis: Analysis) -> str:
     told = timeline(analysis)
     rows = [
-        [f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}", _text(each.event.kind), _text(_said(each.line))]
+        [f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}", _text(each.event.kind), _text(each.event.sentence)]
         for each in told[:_LINES_MOST]
     ]
     return html_table(["UTC", "what", ""], rows) + _more(len(told))
-
-
-def _said(event: dict[str, Any]) -> str:
-    return ", ".join(
-        f"{key} {value}" for key, value in event.items() if key not in _HIDDEN and value not in (None, "")
-    )
 
 
 def _slope(slope: drift.FittedSlope, unit: str) -> str:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from membrane_ctrl.control import gas
-from membrane_ctrl.model import events, run_events, telemetry
+from membrane_ctrl.model import events
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.catalogue import beside, span
 from membrane_ctrl.review.statistics import drift, shape_review, spectra
@@ -57,11 +58,6 @@ def _what(names: list[str]) -> str:
 
 SCHEMA = "membrane-report/1"
 
-_TOLD = (
-    run_events.Started, run_events.GeometryInForce, events.StateEntered, events.Fault, events.Cleared,
-    events.Maintenance, events.MaintenanceOver, events.CommandTaken, run_events.Mark, run_events.Ended,
-)  # fmt: skip
-
 
 def report_table(analysis: Analysis) -> dict[str, Any]:
     """All figures of the report (`membrane-report/1`); NaN where there is none."""
@@ -108,8 +104,8 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
 
 
 def timeline(analysis: Analysis) -> list[LoggedEvent]:
-    """State changes, faults, commands and marks, in order; without events, states from the telemetry."""
-    told = [each for each in analysis.run.log if isinstance(each.event, _TOLD)]
+    """Notable events, in order; without events, states from the telemetry."""
+    told = [each for each in analysis.run.log if each.event.notable]
     if not any(isinstance(each.event, events.StateEntered) for each in told):
         time_s, codes = analysis.level["time_s"], analysis.level["state"]
         lines = (
@@ -225,7 +221,7 @@ def pump_history(newest: Path) -> list[PumpSeen]:
 
 def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
     """What a run told last of its pump, and the gains and curve then set."""
-    status, told = telemetry.RunStatus(), None
+    status, told = RunStatus(), None
     for each in log:
         status = status.after_event(each.event, each.mono_s)
         if isinstance(each.event, events.PumpLearned):

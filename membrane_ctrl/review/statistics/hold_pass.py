@@ -8,7 +8,8 @@ import numpy as np
 
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
-from membrane_ctrl.model.telemetry import RunStatus, State
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.statistics import spectra
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run

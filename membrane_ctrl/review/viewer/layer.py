@@ -12,10 +12,12 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from membrane_ctrl.model import events, telemetry
+from membrane_ctrl.model import events
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
 from membrane_ctrl.model.columns import AGGREGATED, Group, Plot, columns_of, plots_of
+from membrane_ctrl.model.prose import for_people
+from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, changes
 from membrane_ctrl.recorder import rerun_streams
 from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
@@ -160,10 +162,10 @@ class Layer:
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
         told = [e for e in run.log if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]]
         if told:
-            levels = [events.level(each.line) for each in told]
-            texts = [events.sentence(each.line) for each in told]
+            levels = [each.event.level.value for each in told]
+            texts = [each.event.sentence for each in told]
             self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
-        for stream, time_s, values in streams.mark_lines([{**each.line, "mono_s": each.mono_s} for each in run.log]):
+        for stream, time_s, values in streams.mark_lines([(each.mono_s, each.event) for each in run.log]):
             self._style(stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True)
             self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
@@ -296,19 +298,19 @@ def prefix_of(label: str) -> str:
 
 def _summary_page(run: Run) -> str:
     """The page of figures as the recorder wrote it last, from `summary.json`: what `runs` and `report` state."""
-    status = telemetry.RunStatus()
+    status = RunStatus()
     for each in run.log:
         status = status.after_event(each.event, each.mono_s)
     try:
         page = summary_page(run.summary or {}, status, run.config)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError):
         page = "`summary.json` is missing or damaged.\n"
-    name = events.for_people(run.name)
+    name = for_people(run.name)
     return f"**{name}**\n\n{page}\nIntervals and spectra: `membrane-ctrl report {name}`\n"
 
 
 def _size(size: float, unit: str) -> str:
-    return events.for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
+    return for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
 
 
 def _variances(cycles: shapes.Shapes) -> Column:
