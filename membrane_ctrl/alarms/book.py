@@ -1,4 +1,4 @@
-"""The standing alarms and their notices. Time is an argument: no clock, no I/O.
+"""The standing alarms and the messages about them. Time is an argument: no clock, no I/O.
 
 An alarm is raised when its condition has persisted, escalated to more people if nobody acknowledges it, repeated as
 a reminder, and cleared when the condition has stayed away. A condition that returns sooner is the same alarm; a
@@ -22,7 +22,7 @@ class Sign:
     bad: bool  # True: the condition has appeared; False: it has cleared
     severity: Severity = "warning"
     text: str = ""
-    for_s: float = 0.0  # how long the condition must persist before a notice
+    for_s: float = 0.0  # how long the condition must persist before a message
     # which of several conditions under one name; the alarm stands until all clear. With `bad` False, "" means all
     about: str = ""
     anew: bool = False  # once all conditions have cleared, the next one is a new alarm, however soon
@@ -66,14 +66,14 @@ def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
     return None
 
 
-NoticeKind = Literal["raised", "escalated", "reminder", "cleared"]
+MessageKind = Literal["raised", "escalated", "reminder", "cleared"]
 
 
 @dataclass(frozen=True, slots=True)
-class Notice:
-    """A notice to send."""
+class AlarmMessage:
+    """A message to send."""
 
-    kind: NoticeKind  # change of the alarm
+    kind: MessageKind  # change of the alarm
     name: str  # of the alarm, as the next two
     severity: Severity
     text: str
@@ -82,7 +82,7 @@ class Notice:
 
 @dataclass(slots=True)
 class _Alarm:
-    sign: Sign  # content of the notices
+    sign: Sign  # content of the messages
     since_s: float  # of the condition
     standing: dict[str, Sign] = field(default_factory=dict)  # by subject, oldest first
     gone_s: float = math.inf  # when the last condition cleared
@@ -130,7 +130,7 @@ class AlarmBook:
                 return
             if alarm.told:
                 alarm.gone_s = min(alarm.gone_s, now_s)
-            else:  # cleared before any notice
+            else:  # cleared before any message
                 del self._alarms[sign.name]
             return
         alarm.gone_s = math.inf
@@ -143,9 +143,9 @@ class AlarmBook:
         for alarm in self._alarms.values():
             alarm.acknowledged |= alarm.told
 
-    def step(self, now_s: float) -> list[Notice]:
-        """Return the due notices."""
-        notices: list[Notice] = []
+    def step(self, now_s: float) -> list[AlarmMessage]:
+        """Return the due messages."""
+        messages: list[AlarmMessage] = []
         for name, alarm in list(self._alarms.items()):
             kind = self._due(alarm, now_s)
             if kind is None:
@@ -157,10 +157,10 @@ class AlarmBook:
             else:
                 alarm.reminded_s = now_s
                 alarm.escalated |= kind == "escalated"
-            notices.append(Notice(kind, name, alarm.sign.severity, alarm.sign.text, alarm.escalated))
-        return notices
+            messages.append(AlarmMessage(kind, name, alarm.sign.severity, alarm.sign.text, alarm.escalated))
+        return messages
 
-    def _due(self, alarm: _Alarm, now_s: float) -> NoticeKind | None:
+    def _due(self, alarm: _Alarm, now_s: float) -> MessageKind | None:
         config = self._config
         if now_s - alarm.gone_s >= config.clear_after_s:
             return "cleared"

@@ -1,6 +1,6 @@
 """The process that sends alarms: mail servers may take a minute, and the run does not wait for them.
 
-Notices go through Apprise: mail, chat, web hook and many more, each a URL (https://appriseit.com).
+Messages go through Apprise: mail, chat, web hook and many more, each a URL (https://appriseit.com).
 """
 
 import importlib
@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, sign_of_value, signs_of
+from membrane_ctrl.alarms.book import AlarmBook, AlarmMessage, Sign, sign_of_value, signs_of
 from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
 from membrane_ctrl.config import schema
 from membrane_ctrl.config.port import AlarmsConfig
@@ -26,7 +26,7 @@ from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes import child, ring
 
-Send = Callable[[Notice], bool]
+Send = Callable[[AlarmMessage], bool]
 
 _AGAIN_S, _AGAIN_MOST_S = 10.0, 300.0
 # a day without a network must not end in a thousand mails
@@ -34,32 +34,32 @@ _KEPT = 50
 
 
 class Outbox:
-    """A queue of notices, each tried until it is sent; a full box drops the oldest, which `dropped` counts.
+    """A queue of messages, each tried until it is sent; a full box drops the oldest, which `dropped` counts.
 
-    `send` returns whether the notice was sent; it may be slow but must not raise.
+    `send` returns whether the message was sent; it may be slow but must not raise.
     """
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._waiting: deque[Notice] = deque()
+        self._waiting: deque[AlarmMessage] = deque()
         self._due_s = 0.0
         self.failures = 0  # since the last success
         self.dropped = 0
 
-    def post(self, notice: Notice) -> None:
-        """Queue a notice."""
-        self._waiting.append(notice)
+    def post(self, message: AlarmMessage) -> None:
+        """Queue a message."""
+        self._waiting.append(message)
         if len(self._waiting) > _KEPT:
             self._waiting.popleft()
             self.dropped += 1
 
     @property
     def empty(self) -> bool:
-        """All notices are sent."""
+        """All messages are sent."""
         return not self._waiting
 
     def step(self, now_s: float) -> None:
-        """Send queued notices, oldest first, unless the last failure is too recent."""
+        """Send queued messages, oldest first, unless the last failure is too recent."""
         if now_s < self._due_s:
             return
         while self._waiting:
@@ -99,7 +99,7 @@ def require_sendable(config: AlarmsConfig) -> None:
 
 
 def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
-    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every notice names the run.
+    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every message names the run.
 
     Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the URL's line: it may
     hold a password.
@@ -110,10 +110,10 @@ def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
     return [partial(_send, _services(apprise, Path(name)), run) for name in lists]
 
 
-def _send(targets: Sequence[Service], run: str, notice: Notice) -> bool:
-    kind = _TYPES[notice.kind] or {"warning": "warning", "critical": "failure"}[notice.severity]
-    title = f"membrane-ctrl {notice.severity} {notice.kind}: {notice.name}"
-    return send_to_all(targets, title, f"{notice.text}\nrun: {run}", kind)
+def _send(targets: Sequence[Service], run: str, message: AlarmMessage) -> bool:
+    kind = _TYPES[message.kind] or {"warning": "warning", "critical": "failure"}[message.severity]
+    title = f"membrane-ctrl {message.severity} {message.kind}: {message.name}"
+    return send_to_all(targets, title, f"{message.text}\nrun: {run}", kind)
 
 
 def _services(apprise: Any, path: Path) -> list[Service]:
@@ -134,7 +134,7 @@ def _apprise() -> Any:
 
 
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
-    """`alarm test`: send one notice to the alarm addresses, and with `escalated` to the escalation addresses.
+    """`alarm test`: send one message to the alarm addresses, and with `escalated` to the escalation addresses.
 
     Raises InputError without addresses, DeviceError if no service accepts it.
     """
@@ -143,16 +143,16 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
         raise errors.InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL per line")
     if escalated and alarms.escalation_urls_file is None:
         raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; no escalation addresses")
-    notice = Notice("raised", "test", "warning", "this is only a test", escalated)
+    message = AlarmMessage("raised", "test", "warning", "this is only a test", escalated)
     senders = apprise_senders(alarms, "none, a test")
     lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
     with limited_memory():
-        deaf = [file for file, send in zip(lists, senders, strict=False) if not send(notice)]
+        deaf = [file for file, send in zip(lists, senders, strict=False) if not send(message)]
     if as_json:
         print(json.dumps({"sent": not deaf}))
     if deaf:
         raise errors.DeviceError(
-            f"{' and '.join(map(str, deaf))}: no service accepted the notice; check addresses and network"
+            f"{' and '.join(map(str, deaf))}: no service accepted the message; check addresses and network"
         )
     if not as_json:
         print("sent; check that it has arrived")
@@ -164,7 +164,7 @@ _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns ring messages into notices; the first outbox gets all of them, the second only the escalated ones."""
+    """Turns rows and events into alarm messages; the first outbox gets all of them, the second only the escalated ones."""
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
@@ -179,7 +179,7 @@ class Watcher:
         return self._status.ended
 
     def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
-        """Take rows and events, and send due notices."""
+        """Take rows and events, and send due messages."""
         for message in events:
             self._take_event(json.loads(message), now_s)
         for row in rows:
@@ -219,15 +219,15 @@ class Watcher:
             self._book.take(Sign("silent", True, "critical", text), now_s)
 
     def _send(self, now_s: float) -> None:
-        for notice in self._book.step(now_s):
-            for outbox in self._outboxes[: 2 if notice.escalated else 1]:
-                outbox.post(notice)
+        for message in self._book.step(now_s):
+            for outbox in self._outboxes[: 2 if message.escalated else 1]:
+                outbox.post(message)
         for outbox in self._outboxes:
             outbox.step(now_s)
 
 
 _LOOK_S = 0.5
-# After the run's end, for the last notices; longer would delay a service manager's restart
+# After the run's end, for the last messages; longer would delay a service manager's restart
 _LAST_S = 8.0
 _SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
 _TO = ("urls_file", "escalation_urls_file")  # of the configuration, in the order of the senders
@@ -248,7 +248,7 @@ class AlarmsSpec:
 def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     """Watch until the run ends or the control process has gone.
 
-    Target of a `spawn`ed process; `status` is its end of a pipe, for events about sent notices.
+    Target of a `spawn`ed process; `status` is its end of a pipe, for events about sent messages.
     """
     child.leave_at_stop()
     senders = apprise_senders(spec.config, spec.run)
@@ -259,7 +259,7 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
 def watch(
     spec: AlarmsSpec, senders: Sequence[Send], report: Callable[[Event], None], parent_lives: Callable[[], bool]
 ) -> None:
-    """Run the process's loop; `senders` are the one for all notices and the one for escalated ones."""
+    """Run the process's loop; `senders` are the one for all messages and the one for escalated ones."""
     clock = spec.clock
     outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
     watcher = Watcher(spec.config, outboxes, clock.now())
@@ -282,17 +282,17 @@ def watch(
 
 
 def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
-    def sending(notice: Notice) -> bool:
-        through = send(notice)
+    def sending(message: AlarmMessage) -> bool:
+        through = send(message)
         report(
             run_events.AlarmTold(
-                alarm=notice.name,
-                what=notice.kind,
-                severity=notice.severity,
-                text=notice.text,
+                alarm=message.name,
+                what=message.kind,
+                severity=message.severity,
+                text=message.text,
                 to=to,
                 sent=through,
-                escalated=notice.escalated,
+                escalated=message.escalated,
             )
         )
         return through

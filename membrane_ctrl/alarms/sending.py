@@ -1,4 +1,4 @@
-"""Sends a notice through several services at once, in bounded time and memory.
+"""Sends a message through several services at once, in bounded time and memory.
 
 A mail or web server may answer without end, or a byte a minute; the libraries behind Apprise read all of it. So each
 service has a thread of its own, which is left behind after `SERVICE_S`, and the process has a limit of memory.
@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-SERVICE_S = 60.0  # for one notice; a mail server may take most of it
+SERVICE_S = 60.0  # for one message; a mail server may take most of it
 _MEMORY_BYTES = 400_000_000  # beyond what the process has; an honest answer has some kilobytes
 
 
@@ -38,8 +38,8 @@ class Service:
         self._thread.start()
 
     def accepted(self, until_s: float) -> bool:
-        """Whether the service has accepted the notice of the last `begin`, by a time of the monotonic clock."""
-        if self._thread is None or not self._begun:  # what still hangs is an earlier notice
+        """Whether the service has accepted the message of the last `begin`, by a time of the monotonic clock."""
+        if self._thread is None or not self._begun:  # what still hangs is an earlier message
             return False
         self._thread.join(max(0.0, until_s - time.monotonic()))
         return not self._thread.is_alive() and self._accepted
@@ -52,11 +52,11 @@ class Service:
 
 
 def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -> bool:
-    """Send a notice to every service; one success suffices: a dead chat server must not repeat the mail forever."""
+    """Send a message to every service; one success suffices: a dead chat server must not repeat the mail forever."""
     until_s = time.monotonic() + SERVICE_S
     for service in services:
         service.begin(title, body, kind)
-    accepted = [service.accepted(until_s) for service in services]  # wait for all: each gets every notice
+    accepted = [service.accepted(until_s) for service in services]  # wait for all: each gets every message
     return any(accepted)
 
 

@@ -16,7 +16,7 @@ from membrane_ctrl.console.quantities import labelled, quantity
 from membrane_ctrl.console.why import duration, holders, number, percent
 from membrane_ctrl.model import columns, telemetry
 from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
-from membrane_ctrl.model.event_base import Event, Level
+from membrane_ctrl.model.event_base import Event, LogLevel
 from membrane_ctrl.model.events import StateEntered
 from membrane_ctrl.model.run_events import from_dict
 
@@ -78,7 +78,7 @@ _LABELS = 8  # characters
 _EDGES = 5 + _LABELS  # borders, padding and labels beside a trend
 _BAR_ROWS_MAX = 6
 _EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
-_LEVEL_STYLES = {Level.ERROR: "bold red", Level.WARNING: "yellow"}
+_LEVEL_STYLES = {LogLevel.ERROR: "bold red", LogLevel.WARNING: "yellow"}
 
 
 class ConsolePage:

@@ -21,7 +21,7 @@ KINDS: dict[str, type["Event"]] = {}
 _ENVELOPE = frozenset({"time_utc", "mono_s", "kind", "crc32"})
 
 
-class Level(StrEnum):
+class LogLevel(StrEnum):
     """How logs mark an event."""
 
     INFO = "INFO"
@@ -40,7 +40,7 @@ class Event:
         Kind of the lines.
     sentence : str
         Template of the sentence (`prose.fill`) over the keys of the line and properties of the class.
-    level : Level
+    level : LogLevel
     opens, closes : tuple of Topic
         Topics of the notices that it may open or close.
     subject : str
@@ -55,7 +55,7 @@ class Event:
 
     _kind: ClassVar[str] = ""
     _template: ClassVar[str] = "{message}"
-    _level: ClassVar[Level] = Level.INFO
+    _level: ClassVar[LogLevel] = LogLevel.INFO
     _subject: ClassVar[str] = ""
     _severity: ClassVar[Severity] = "warning"
     _delay_s: ClassVar[float] = 0.0
@@ -70,7 +70,7 @@ class Event:
         *,
         kind: str = "",
         sentence: str = "{message}",
-        level: Level = Level.INFO,
+        level: LogLevel = LogLevel.INFO,
         opens: tuple[Topic, ...] = (),
         closes: tuple[Topic, ...] = (),
         subject: str = "",
@@ -94,7 +94,7 @@ class Event:
         return self._kind
 
     @property
-    def level(self) -> Level:
+    def level(self) -> LogLevel:
         """How logs mark it."""
         return self._level
 
@@ -119,7 +119,7 @@ class Event:
     @property
     def notable(self) -> bool:
         """Whether logs and reports show it."""
-        return self._notable or self.level is not Level.INFO or bool(self.opens) or bool(self.closes)
+        return self._notable or self.level is not LogLevel.INFO or bool(self.opens) or bool(self.closes)
 
     @property
     def plot_mark(self) -> str:

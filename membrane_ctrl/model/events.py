@@ -4,7 +4,7 @@ from typing import Any
 
 from membrane_ctrl.model.event_base import Event as Event
 from membrane_ctrl.model.event_base import EventLine as EventLine
-from membrane_ctrl.model.event_base import Level
+from membrane_ctrl.model.event_base import LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Notice, NoticeChanges, NoticeKey, Notices, Topic
 
 _COMMAND_UNITS = {"setpoint": "um", "manual": "um/s", "gains": "s on trial"}  # of a command's value
@@ -45,7 +45,7 @@ class Fault(
     Event,
     kind="fault",
     sentence="Fault {name}[: {cause}][ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level {safe_level}]",
-    level=Level.ERROR,
+    level=LogLevel.ERROR,
     opens=(Topic.FAULT, Topic.GLITCH),
     delay_s=GLITCH_S,
     urgent=True,
@@ -117,9 +117,9 @@ class CommandTaken(
     refused: str | None = None
 
     @property
-    def level(self) -> Level:
+    def level(self) -> LogLevel:
         """A refused command is a warning."""
-        return Level.WARNING if self.refused else Level.INFO
+        return LogLevel.WARNING if self.refused else LogLevel.INFO
 
     @property
     def unit(self) -> str:
@@ -136,7 +136,7 @@ class LockSet(
     Event,
     kind="lock",
     sentence='Locked by {author}[ ({session})][, {set_utc}]: "{text}", word {word}',
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.LOCK,),
     subject="word",
 ):
@@ -169,7 +169,9 @@ class LockRemoved(
     number: int
 
 
-class GainsReverted(Event, kind="gains_reverted", sentence="Gains on trial are reverted: {why}", level=Level.WARNING):
+class GainsReverted(
+    Event, kind="gains_reverted", sentence="Gains on trial are reverted: {why}", level=LogLevel.WARNING
+):
     """Gains on trial were reverted."""
 
     why: str
@@ -189,7 +191,7 @@ class Plausibility(
     kind="plausibility",
     sentence="Laser and camera disagree[, {culprit} is wrong][ ({seen})]. Do: check the laser's mount, the camera "
     "and the screen",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.PLAUSIBILITY,),
     closes=(Topic.PLAUSIBILITY,),
 ):
@@ -209,9 +211,9 @@ class Plausibility(
         return {"laser": "the laser", "optics": "the camera"}.get(self.liar, "")
 
     @property
-    def level(self) -> Level:
+    def level(self) -> LogLevel:
         """An agreement is no warning."""
-        return Level.WARNING if self.stands else Level.INFO
+        return LogLevel.WARNING if self.stands else LogLevel.INFO
 
     def _choose_template(self) -> str:
         return self._template if self.stands else "Laser and camera agree again[ ({seen})]"
@@ -228,7 +230,7 @@ class Maintenance(
     Event,
     kind="maintenance",
     sentence="Maintenance {name}: {message}",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.MAINTENANCE,),
     subject="name",
 ):
@@ -267,7 +269,7 @@ class InterlockOpened(
     Event,
     kind="interlock_opened",
     sentence="Interlock {name} is open[: {text}]",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.INTERLOCK,),
     subject="name",
 ):

@@ -4,7 +4,7 @@ import json
 import math
 from typing import Any
 
-from membrane_ctrl.model.event_base import KINDS, Event, EventLine, Level, UnknownEvent
+from membrane_ctrl.model.event_base import KINDS, Event, EventLine, LogLevel, UnknownEvent
 from membrane_ctrl.model.notices import GLITCH_S, NoticeChanges, NoticeKey, Notices, Topic
 
 CONNECTED_AGAIN = "connected again"
@@ -47,7 +47,7 @@ class Ended(
         return self.exit not in _ENDED_WELL
 
 
-class NoClaim(Event, kind="no_claim", level=Level.WARNING):
+class NoClaim(Event, kind="no_claim", level=LogLevel.WARNING):
     """The board cannot reserve itself for one program."""
 
     message: str
@@ -72,24 +72,24 @@ class Link(
         return not self.up
 
     @property
-    def level(self) -> Level:
+    def level(self) -> LogLevel:
         """A failure is a warning."""
-        return Level.INFO if self.up else Level.WARNING
+        return LogLevel.INFO if self.up else LogLevel.WARNING
 
 
-class InputsNotRecorded(Event, kind="inputs_not_recorded", level=Level.WARNING):
+class InputsNotRecorded(Event, kind="inputs_not_recorded", level=LogLevel.WARNING):
     """Some ticks cannot be replayed."""
 
     message: str
 
 
-class ShapeUnreadable(Event, kind="shape_unreadable", level=Level.WARNING):
+class ShapeUnreadable(Event, kind="shape_unreadable", level=LogLevel.WARNING):
     """A message of the acquisition is unreadable."""
 
     message: str
 
 
-class UnreadableEvent(Event, kind="unreadable_event", level=Level.ERROR):
+class UnreadableEvent(Event, kind="unreadable_event", level=LogLevel.ERROR):
     """A message that is no event."""
 
     message: str
@@ -100,7 +100,7 @@ class LatchFailed(
     kind="latch_failed",
     sentence="The latched fault is not on the disk: {message}. Do: mend the disk; until then the next start would "
     "not see the fault",
-    level=Level.ERROR,
+    level=LogLevel.ERROR,
     opens=(Topic.LATCH,),
     severity="critical",
 ):
@@ -119,7 +119,7 @@ class LockNotStored(
     Event,
     kind="lock_not_stored",
     sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then only this run knows the lock",
-    level=Level.ERROR,
+    level=LogLevel.ERROR,
     opens=(Topic.LOCK_STORAGE,),
     subject="word",
     severity="critical",
@@ -151,7 +151,7 @@ class ChildEnded(
     Event,
     kind="child_ended",
     sentence="The {child} process ended[ with exit code {exit_code}]; the hold continues",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.CHILD,),
     subject="child",
     delay_s=GLITCH_S,
@@ -166,7 +166,7 @@ class ChildSilent(
     Event,
     kind="child_silent",
     sentence="The {child} process does not answer; the hold continues",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.CHILD,),
     subject="child",
     delay_s=GLITCH_S,
@@ -202,7 +202,7 @@ class ChildGivenUp(
     Event,
     kind="child_given_up",
     sentence="The {child} process ended too often and is not replaced for an hour. Do: check the run",
-    level=Level.ERROR,
+    level=LogLevel.ERROR,
     opens=(Topic.CHILD,),
     subject="child",
 ):
@@ -224,9 +224,9 @@ class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[
     traceback: str | None = None
 
     @property
-    def level(self) -> Level:
+    def level(self) -> LogLevel:
         """A failure is an error; a camera that does not answer yet is a warning."""
-        return {"failed": Level.ERROR, "retrying": Level.WARNING}.get(self.state, Level.INFO)
+        return {"failed": LogLevel.ERROR, "retrying": LogLevel.WARNING}.get(self.state, LogLevel.INFO)
 
     @property
     def notable(self) -> bool:
@@ -272,7 +272,7 @@ class Vibrations(Event, kind="vibrations", sentence="Vibrations of the mirror: {
     message: str
 
 
-class FramesLeftOut(Event, kind="raw_frames", level=Level.WARNING):
+class FramesLeftOut(Event, kind="raw_frames", level=LogLevel.WARNING):
     """Frames around a fault are not kept."""
 
     left_out: int
@@ -288,7 +288,7 @@ class RecorderError(
     Event,
     kind="recorder_error",
     sentence="Not recorded: {message}. Do: check the disk and the folder of the run",
-    level=Level.ERROR,
+    level=LogLevel.ERROR,
     opens=(Topic.RECORDING,),
     subject="what",
 ):
@@ -302,7 +302,7 @@ class DiskLow(
     Event,
     kind="disk_low",
     sentence="Disk almost full: {message}",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.RECORDING,),
     subject="what",
 ):
@@ -357,7 +357,7 @@ class PortFailed(
     Event,
     kind="port_failed",
     sentence="Control port {port} failed: {message}[. Tries again in {again_s:g} s]",
-    level=Level.WARNING,
+    level=LogLevel.WARNING,
     opens=(Topic.PORT,),
     subject="port",
     delay_s=GLITCH_S,
@@ -393,7 +393,7 @@ class CommanderChanged(Event, kind="commander", sentence="Control taken by {who}
         return self._template if self.who else "Control released[ by {former}][: {why}]"
 
 
-class Refused(Event, kind="refused", sentence="Refused {command} of {who}: {reason}", level=Level.WARNING):
+class Refused(Event, kind="refused", sentence="Refused {command} of {who}: {reason}", level=LogLevel.WARNING):
     """The port refused a request, and perhaps others not recorded."""
 
     who: str

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.acquisition.session import listener
-from membrane_ctrl.alarms.book import Notice
+from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.process import Outbox, Watcher
 from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.port import AlarmsConfig
@@ -80,13 +80,13 @@ class Hold:
         self.supervisor = Supervisor(
             Controller(config, zernike_projection()), Wiring(None, events=self.rings["events"]), self.clock, 50.0
         )
-        self.alarms: list[Notice] = []
+        self.alarms: list[AlarmMessage] = []
         self.taken = 0
         HandClock.moment_s = 0.0
         self.watcher = Watcher(AlarmsConfig(), [Outbox(self._sent)], 0.0)
         self.restart_acquisition()
 
-    def _sent(self, notice: Notice) -> bool:
+    def _sent(self, notice: AlarmMessage) -> bool:
         self.alarms.append(notice)
         return True
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from membrane_ctrl.alarms.book import AlarmBook, Notice, Sign, signs_of
+from membrane_ctrl.alarms.book import AlarmBook, AlarmMessage, Sign, signs_of
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.run_events import ChildRestarted, DiskLow
@@ -19,7 +19,7 @@ CONFIG = AlarmsConfig(escalate_after_s=900, remind_every_s=3600, clear_after_s=3
 BAD, GOOD = Sign("leak", True, "warning", "it leaks", for_s=10.0), Sign("leak", False)
 
 
-def kinds(notices: list[Notice]) -> list[str]:
+def kinds(notices: list[AlarmMessage]) -> list[str]:
     return [notice.kind for notice in notices]
 
 
@@ -34,7 +34,7 @@ def test_a_condition_must_stand_for_its_time() -> None:
     book = AlarmBook(CONFIG)
     book.take(BAD, 0.0)
     assert book.step(9.9) == []
-    assert book.step(10.0) == [Notice("raised", "leak", "warning", "it leaks")]
+    assert book.step(10.0) == [AlarmMessage("raised", "leak", "warning", "it leaks")]
     assert book.step(11.0) == [], "told once"
 
 

@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-from membrane_ctrl.alarms.book import Notice
+from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.process import (
     AlarmsSpec,
     Outbox,
@@ -34,18 +34,18 @@ from membrane_ctrl.processes.ring import RingWriter, ring
 
 CONFIG = AlarmsConfig(silent_s=5.0)
 ROW = TelemetryRow(*(0.0 for _ in FIELDS))
-TEST = Notice("raised", "test", "warning", "text")
+TEST = AlarmMessage("raised", "test", "warning", "text")
 
 
 class FakeSender:
     """Takes notices, unless the network is down."""
 
     def __init__(self) -> None:
-        self.through: list[Notice] = []
+        self.through: list[AlarmMessage] = []
         self.tried = 0
         self.down = False
 
-    def __call__(self, notice: Notice) -> bool:
+    def __call__(self, notice: AlarmMessage) -> bool:
         self.tried += 1
         if not self.down:
             self.through.append(notice)
@@ -269,7 +269,7 @@ def test_alarm_test(
         config.read_text() + f'escalation_urls_file = "{urls(tmp_path, "refusing://x", name="more.txt")}"\n'
     )
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 4
-    assert "more.txt: no service accepted the notice" in capsys.readouterr().err
+    assert "more.txt: no service accepted the message" in capsys.readouterr().err
     urls(tmp_path, "refusing://ann")
     assert run(["alarm", "test", "--config", str(config)]) == 4
     assert run(["alarm", "test"]) == 2

@@ -13,7 +13,7 @@ from typing import Any
 
 GREETING = {"membrane_ctrl": 1, "run": "evil", "you": "unix:x", "role": "tune", "commander": None}
 STATUS: dict[str, Any] = {
-    "state": "hold", "why": "", "row": {"error_um": 0.1}, "fault": None, "maintenance": {}, "recording": {},
+    "state": "hold", "why": "", "row": {"error_um": 0.1}, "fault": None, "notices": [],
 }  # fmt: skip
 _HUGE = "9" * 4000
 
@@ -55,9 +55,11 @@ ANSWERS: dict[str, bytes] = {
     "fault_text": status_line(fault="boom"),
     "fault_part": status_line(fault={"code": 1}),
     "fault_types": status_line(fault={"code": "x", "name": 1, "cause": [], "remedy": {}}),
-    "maintenance_list": status_line(maintenance=["x"]),
-    "maintenance_numbers": status_line(maintenance={"leak": 1}),
-    "recording_text": status_line(recording="x"),
+    "notices_text": status_line(notices="x"),
+    "notices_list": status_line(notices=["x"]),
+    "notice_part": status_line(notices=[{"topic": "recorder", "text": "x"}]),
+    "notice_numbers": status_line(notices=[{"topic": "recorder", "subject": 1, "severity": 2, "text": 3}]),
+    "recording_text": status_line(recording_ok="x"),
     "state_list": status_line(state=["hold"]),
     "state_html": status_line(state="<img src=x onerror=alert(1)>"),
     "state_escape": status_line(state="hold\x1b[2J"),

@@ -58,7 +58,7 @@ def test_the_cause_names_the_field(tmp_path: Path) -> None:
         "error_text": "status.row.error_um",
         "error_inf": "status.row.error_um: not a finite number",
         "fault_part": "status.fault.name: missing",
-        "maintenance_list": "status.maintenance",
+        "notices_list": "status.notices",
         "status_missing": "status: missing",
         "long": "a line of more than 65536 bytes",
     }
@@ -71,10 +71,13 @@ def test_the_cause_names_the_field(tmp_path: Path) -> None:
             hold.ask(do="status")
 
 
+NOTICE = {"topic": "maintenance", "subject": "leak", "severity": "warning"}
+
+
 def test_texts_of_a_peer_cannot_drive_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = f"\x1b]0;owned\x07\x1b[2J\r\n{BIDI}<img src=x>"
     fault = {"code": 1, "name": text, "cause": text, "remedy": text}
-    line = evil.status_line(why=text, fault=fault, maintenance={"leak": text}, commander=text)
+    line = evil.status_line(why=text, fault=fault, notices=[{**NOTICE, "text": text}], commander=text)
     with evil.peer(tmp_path / "control.sock", evil.answering(line)) as path:
         assert run(["ctl", "status", "--socket", str(path)]) == 0
         with PortClient.unix(path, print) as hold:

@@ -15,10 +15,17 @@ async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
         run.port.told(GeometryInForce("12ab", None, None, ""))
         run.port.told(Maintenance("calibrate", "calibrate again"))
         status = run.port.status()
-        assert status["maintenance"] == {"calibrate": "calibrate again"}
+        assert status["notices"] == [
+            {
+                "topic": "maintenance",
+                "subject": "calibrate",
+                "severity": "warning",
+                "text": "Maintenance calibrate: calibrate again",
+            }
+        ]
         assert status["geometry"]["hash"] == "12ab"
         run.port.told(MaintenanceOver("calibrate", "fits again"))
-        assert run.port.status()["maintenance"] == {}
+        assert run.port.status()["notices"] == []
 
 
 async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_is_over(tmp_path: Path) -> None:
@@ -26,8 +33,12 @@ async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_
         run.port.told(DiskLow("disk", "less than 500 MB free"))
         run.port.told(RecorderError("state file", "state file: x"))
         run.port.told(RecorderRecovered("state file", "state file works again"))
-        assert run.port.status()["recording"] == {"disk": "less than 500 MB free"}
+        status = run.port.status()
+        assert [notice["subject"] for notice in status["notices"]] == ["disk"]
+        assert status["recording_ok"] is False
         assert "membrane_recording_ok 0.0" in run.port.metrics()
         run.port.told(RecorderRecovered("disk", "disk works again"))
-        assert run.port.status()["recording"] == {}
+        status = run.port.status()
+        assert status["notices"] == []
+        assert status["recording_ok"] is True
         assert "membrane_recording_ok 1.0" in run.port.metrics()

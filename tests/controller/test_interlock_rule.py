@@ -335,13 +335,9 @@ def test_the_status_names_the_open_ones() -> None:
     status = RunStatus()
     for event in rig.events:
         status = status.after_event(event)
-    assert status.interlock_lines == (
-        "interlock door is open: shut the door",
-        "interlock supply is open: open the bottle",
-    )
-    assert status.after_event(InterlockClosed("door")).interlock_lines == (
-        "interlock supply is open: open the bottle",
-    )
+    door, supply = "Interlock door is open: shut the door", "Interlock supply is open: open the bottle"
+    assert [notice.text for notice in status.other_notices] == [door, supply]
+    assert [notice.text for notice in status.after_event(InterlockClosed("door")).other_notices] == [supply]
 
 
 def test_a_replay_decides_the_same_to_the_last_bit() -> None:

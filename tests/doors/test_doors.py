@@ -115,10 +115,12 @@ def test_a_figure_has_its_age_and_terms() -> None:
 
 def test_faults_and_notices_are_in_words() -> None:
     seen = seen_hold()
-    seen.status.update(fault=FAULT, maintenance={"leak": "the leak grows"}, recording={"disk": "disk full"})
+    notices = [{"topic": "interlock", "text": "door open"}, {"topic": "recorder", "text": "disk full"}]
+    seen.status.update(fault=FAULT, notices=notices)
     found = values(seen)
     assert found["fault"] == "7 laser_lost: no light; clean it"
-    assert found["notices"] == "the leak grows; disk full"
+    assert found["interlocks"] == "door open"
+    assert found["notices"] == "door open; disk full"
 
 
 @pytest.mark.parametrize(

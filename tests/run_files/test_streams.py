@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, changes, column, unpack
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
 from membrane_ctrl.recorder.blueprint import FAULT, STATE
@@ -107,7 +109,7 @@ def test_low_orders_have_the_variances_of_their_cycle(tmp_path: Path) -> None:
 
 
 def test_lines_are_vertical_and_of_their_kind() -> None:
-    told = [
+    told: list[dict[str, Any]] = [
         {"kind": "command", "command": "setpoint", "mono_s": 2.0},
         {"kind": "command", "command": "vent", "mono_s": 3.0, "refused": "not now"},
         {"kind": "command", "command": "resume", "mono_s": 4.0},
@@ -117,7 +119,8 @@ def test_lines_are_vertical_and_of_their_kind() -> None:
         {"kind": "fault", "mono_s": 9.0},
         {"kind": "why", "mono_s": 8.0},
     ]
-    found = {stream.path: (time_s, values[:, 0]) for stream, time_s, values in mark_lines(told)}
+    timed = [(line["mono_s"], from_dict(line)) for line in told]
+    found = {stream.path: (time_s, values[:, 0]) for stream, time_s, values in mark_lines(timed)}
     assert {path: sorted(set(np.round(time_s, 6))) for path, (time_s, _) in found.items()} == {
         "/marks/setpoint": [2.0],
         "/marks/pause": [4.0],

@@ -127,13 +127,13 @@ def test_leaving_hold_ends_the_settled_rows() -> None:
 def test_events_and_cycles() -> None:
     summary = Summary(Config())
     fault = {"kind": "fault", "mono_s": 3.0, "cause": "over_pressure"}
-    for event in ({"kind": "state"}, fault, {"kind": "end", "mono_s": 9.5, "exit": 5}):
+    for event in ({"kind": "state"}, fault, {"kind": "end", "mono_s": 9.5, "exit": "safety_trip"}):
         summary.add_event(event)
     latencies_s = np.linspace(0.02, 0.12, 40)
     for k, latency_s in enumerate(latencies_s):
         summary.add_shape(replace(shape_of(float(k), k, "rejected" if k < 3 else "ok"), latency_s=float(latency_s)))
     found = summary.as_dict({}, {})
-    assert (found["faults"], found["fault_count"], found["exit"]) == ([fault], 1, 5)
+    assert (found["faults"], found["fault_count"], found["exit"]) == ([fault], 1, "safety_trip")
     assert found["duration_s"] == 9.5
     assert (found["cycles"], found["cycles_rejected"]) == (40, 3)
     assert found["cycle_latency_ms"]["p50"] == pytest.approx(np.quantile(latencies_s, 0.5) * 1e3, rel=0.05)

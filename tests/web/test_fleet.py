@@ -90,7 +90,9 @@ def test_the_table_shows_alarms_first_and_no_old_numbers() -> None:
     status = {"state": "hold", "why": "", "row": {"error_um": 0.256}}
     good = dataclasses.replace(feeds["good"].seen, problem="", seen_s=now_s, status=status)
     feeds["good"].seen = good
-    feeds["bad"].seen = dataclasses.replace(good, status={**status, "maintenance": {"leak": "the leak grows"}})
+    feeds["bad"].seen = dataclasses.replace(
+        good, status={**status, "notices": [{"topic": "maintenance", "text": "the leak grows"}]}
+    )
     feeds["gone"].seen = dataclasses.replace(good, seen_s=now_s - 100.0)
     assert fleet_rows(feeds) == [
         {"hold": "good", "state": "hold", "error": 0.26, "says": "as it should be"},

@@ -92,10 +92,15 @@ def test_what_the_page_states_of_a_viewer_is_read_by_the_port_and_a_link_is_no_a
 def test_locks_come_first_among_the_alarms() -> None:
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
     fault = {"code": 51, "name": "locked", "cause": "a lock", "remedy": "ask"}
-    shown = alarm_lines({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault})
-    assert shown.startswith('LOCKED "hands inside" by unix:ann, 2026-01-02, word bofak; LOCKED')
-    assert "gumil" in shown
-    assert alarm_lines({"locks": [], "fault": None}) == ""
+    notice = {"topic": "recorder", "subject": "disk", "severity": "warning", "text": "Disk almost full"}
+    shown = alarm_lines({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault, "notices": [notice]})
+    assert shown == [
+        'LOCKED "hands inside" by unix:ann, 2026-01-02, word bofak',
+        'LOCKED "hands inside" by unix:ann, 2026-01-02, word gumil',
+        "FAULT 51 locked: a lock; ask",
+        "Disk almost full",
+    ]
+    assert alarm_lines({"locks": [], "fault": None, "notices": []}) == []
 
 
 @pytest.mark.parametrize(
