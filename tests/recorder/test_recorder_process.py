@@ -131,7 +131,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         for cycle in range(5):
             feed.shapes.put(pack_estimate(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok")))
         feed.event("fault", mono_s=19.0, cause="over_pressure")
-        feed.event("end", mono_s=20.0, exit=0)
+        feed.event("end", mono_s=20.0, exit="done")
         process.join(DEADLINE_S)
         assert process.exitcode == 0
         assert [report["kind"] for report in received(status)] == ["recorder_done"]
@@ -163,7 +163,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
 def test_what_the_ring_overwrote_is_counted(feed: Feed) -> None:
     for row in rows_of(60.0):  # 3000 rows into 2000 slots, before anyone reads
         feed.inputs.put(message_of(row))
-    feed.event("end", mono_s=60.0, exit=0)
+    feed.event("end", mono_s=60.0, exit="done")
     recorder_in_process(feed.spec)
     found = summary_of(feed.spec.run_dir)
     assert found["dropped"]["inputs"] == 1000
@@ -259,7 +259,7 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
                 feed.inputs.put(message_of(row))
                 fed.append(row.mono_s)
             wait_for(lambda enough=enough_bytes: recorded_bytes(run_dir) >= enough)
-        feed.event("end", mono_s=fed[-1], exit=0)
+        feed.event("end", mono_s=fed[-1], exit="done")
         process.join(DEADLINE_S)
         assert process.exitcode == 0
         kinds = [report["kind"] for report in received(status)]
