@@ -164,7 +164,7 @@ _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns rows and events into alarm messages; the first outbox gets all of them, the second only the escalated ones."""
+    """Turns rows and events into alarm messages; the first outbox gets all, the second only the escalated ones."""
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
