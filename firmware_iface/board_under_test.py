@@ -1,4 +1,4 @@
-"""A board under test: the conformance test's access to it, and its errors."""
+"""A board under test: the conformance test's access to it."""
 
 import asyncio
 import secrets
@@ -7,21 +7,12 @@ from functools import partial
 
 from firmware_iface import register_map, roles
 from firmware_iface.links.modbus_tcp import ModbusLink
+from firmware_iface.requirement import ConformanceError, require
 
 PUMP_FRACTION = 0.05  # below what starts a diaphragm pump
 PERIOD_S = 0.3  # watchdog period during the test
 REST_S = 10.0  # watchdog period between the checks and where a check is not about it
 _U32_MAX = 2**32 - 1
-
-
-class ConformanceError(Exception):
-    """The board violated a requirement; the message says how."""
-
-
-def require(right: bool, problem: str) -> None:
-    """Raise ConformanceError with the problem unless the board behaved correctly."""
-    if not right:
-        raise ConformanceError(problem)
 
 
 class BoardUnderTest:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from functools import partial
 
 from firmware_iface import board_under_test, register_map, roles
-from firmware_iface.board_under_test import PERIOD_S, PUMP_FRACTION, REST_S, other_key, require
+from firmware_iface.board_under_test import PERIOD_S, PUMP_FRACTION, REST_S, other_key
 from firmware_iface.links.modbus_rtu import ModbusLinks
+from firmware_iface.requirement import ConformanceError, require
 
 _GRACE_S = 0.1  # the board's own loop and one wake-up after the period
 _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
@@ -79,7 +80,7 @@ class Conformance(board_under_test.BoardUnderTest):
         problem = ""
         try:
             await test()
-        except board_under_test.ConformanceError as error:
+        except ConformanceError as error:
             problem = str(error)
         except roles.LinkDownError:
             raise
@@ -211,7 +212,7 @@ class Conformance(board_under_test.BoardUnderTest):
             await self._link.read_holding(last, 1)
         except roles.DeviceRefusedError:
             return
-        raise board_under_test.ConformanceError(f"answers a read of register {last}, which the map does not have")
+        raise ConformanceError(f"answers a read of register {last}, which the map does not have")
 
     async def _settings(self) -> None:
         for period_s in (PERIOD_S, 1.5):
@@ -228,7 +229,7 @@ class Conformance(board_under_test.BoardUnderTest):
             await self._arm(REST_S, 0.0)
         except roles.DeviceRefusedError:
             return
-        raise board_under_test.ConformanceError("lets the watchdog be disarmed while the pump is commanded")
+        raise ConformanceError("lets the watchdog be disarmed while the pump is commanded")
 
     async def _silent(self) -> None:
         await self._arm()

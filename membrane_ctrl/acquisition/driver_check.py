@@ -14,6 +14,7 @@ from membrane_ctrl.processes import child
 
 _LOADED_S = 60.0  # a large package on a busy machine
 _NICE = 0
+_PACKAGES = "devices.camera, devices.screen: the drivers' packages"
 
 
 def require_optics(devices: DevicesConfig) -> None:
@@ -28,16 +29,15 @@ def require_optics(devices: DevicesConfig) -> None:
     loading.start()
     theirs.close()
     try:
-        problem = str(ours.recv()) if ours.poll(_LOADED_S) else f"do not load within {_LOADED_S:g} s"
+        problem = str(ours.recv()) if ours.poll(_LOADED_S) else f"{_PACKAGES} do not load within {_LOADED_S:g} s"
     except (EOFError, OSError):
         loading.join(1.0)
-        problem = f"loading ended the process ({loading.exit_code})"
+        problem = f"{_PACKAGES} ended the process that loads them ({loading.exit_code})"
     finally:
         loading.stop(0.0)
         ours.close()
     if problem:
-        where = "" if problem.startswith("devices.") else "devices.camera, devices.screen: the drivers' packages "
-        raise InputError(f"{where}{problem}")
+        raise InputError(problem)
 
 
 def report_problem(devices: DevicesConfig, control: Connection) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from firmware_iface import roles
+from firmware_iface import drivers, roles
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import ROLES, DevicesConfig
 from membrane_ctrl.model import errors
@@ -35,23 +35,31 @@ _OTHERS = {
 }
 
 
+_OPTICS = {
+    "camera": {"camera": 'driver = "external"\nname = "{name}"\n', "screen": 'driver = "pygame"\n'},
+    "screen": {"camera": 'driver = "aravis"\n', "screen": 'driver = "external"\nname = "{name}"\n'},
+}
+ROLES_OF_DRIVERS = (*ROLES, *_OPTICS)
+
+
 def write_package(name: str, role: str, folder: Path) -> int:
     """Write the folder `<name>-driver` below another one, never over an existing one, and print what to do next.
 
     Raises InputError for a name that is taken or is none, an unknown role, and a folder that cannot be written.
     """
     _require_free(name)
-    if role not in ROLES:
-        raise errors.InputError(f"--role {role}: no such role; {toml_file.hint(role, list(ROLES))}")
-    words = _substitutes(name, role)
+    if role not in ROLES_OF_DRIVERS:
+        raise errors.InputError(f"--role {role}: no such role; {toml_file.hint(role, list(ROLES_OF_DRIVERS))}")
+    words = _names(name, role) | (_optics(name, role) if role in _OPTICS else _instrument(role))
     target = folder / f"{words['dashed']}-driver"  # with a dash, Python never takes the folder for the module
     kind = "actuator" if role in ("pump", "vent") else "displacement" if role == "displacement" else "value"
+    prefix, lab = (f"{role}_", "optics_lab.toml.txt") if role in _OPTICS else ("", "lab.toml.txt")
     files = {
         "pyproject.toml": "pyproject.toml.txt",
-        f"{name}.py": "driver.txt",
-        f"{name}_emulator.py": "emulator.txt",
-        f"test_{name}.py": "test.txt",
-        "lab.toml": "lab.toml.txt",
+        f"{name}.py": f"{prefix}driver.txt",
+        f"{name}_emulator.py": f"{prefix}emulator.txt",
+        f"test_{name}.py": f"{prefix}test.txt",
+        "lab.toml": lab,
     }
     with errors.writing(target):
         if target.exists() or target.is_symlink():
@@ -85,19 +93,39 @@ def _drivers(section: type[Any]) -> set[str]:
     return {str(tag) for tag in toml_file.tags(section)}.union(*(_drivers(each) for each in inner))
 
 
-def _substitutes(name: str, role: str) -> dict[str, Any]:
-    words = _WORDS[role]
-    first, second = _EXAMPLES.get(role, (21.5, 23.0))
-    unit, divisor = words["unit"], words["divisor"]
-    others = {other: table for other, table in _OTHERS.items() if other != role}
+def _names(name: str, role: str) -> dict[str, Any]:
+    """Return what every template calls the driver and its entry point groups."""
+    kind = {"camera": drivers.CAMERAS, "screen": drivers.SCREENS}.get(role, drivers.SENSORS)
     return {
-        **words,
         "name": name,
         "dashed": name.replace("_", "-"),
         "title": name.replace("_", " ").title(),
         "Class": "".join(word.capitalize() for word in name.split("_")),
         "MODEL": name.replace("_", "").upper(),
         "role": role,
+        "drivers": kind.group,
+        "emulators": kind.emulators,
+    }
+
+
+def _optics(name: str, role: str) -> dict[str, Any]:
+    """Return what the configuration of a camera or screen has beside it."""
+    tables = {device: table.format(name=name) for device, table in _OPTICS[role].items()}
+    return {**tables, "others": _tables(_OTHERS)}
+
+
+def _tables(devices: dict[str, str]) -> str:
+    return "".join(f"[devices.{role}]\n{table}\n" for role, table in devices.items())
+
+
+def _instrument(role: str) -> dict[str, Any]:
+    """Return what the templates of an instrument say of its role."""
+    words = _WORDS[role]
+    first, second = _EXAMPLES.get(role, (21.5, 23.0))
+    unit, divisor = words["unit"], words["divisor"]
+    others = {other: table for other, table in _OTHERS.items() if other != role}
+    return {
+        **words,
         "read": roles.READS[role][0],
         "role_unit": roles.READS[role][1],
         "suffix": {"degC": "c"}.get(unit, unit.lower()),
@@ -109,7 +137,7 @@ def _substitutes(name: str, role: str) -> dict[str, Any]:
         "second": second,
         "barometer": str(role == "barometer").lower(),
         "thermometer": str(role == "thermometer").lower(),
-        "others": "".join(f"[devices.{other}]\n{table}\n" for other, table in others.items()),
+        "others": _tables(others),
     }
 
 
