@@ -10,6 +10,7 @@ _.put_nowait, maxsize, _.MaximumPacketSize  # aiomqtt and paho use these
 acquisition_main, alarms_main, console_main, recorder_main  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
+list_checks  # of the conformance tests: called by the tests of drivers' packages
 Camera  # the role that the camera drivers fill
 AravisCamera, FolderCamera, PygameDisplay, UvcCamera  # named as text in firmware_iface/drivers/__init__.py
 _.common_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md

@@ -156,7 +156,11 @@ def _of_other_packages(word: str) -> list[TableHelp]:
         except ValueError as error:
             raise InputError(str(error)) from None
         places = [(place, None) for place in _places_of_driver(driver, kind)]
-        found.append(replace(_table(json_schema(driver.Settings), places), driver="external"))
+        try:
+            table = _table(json_schema(driver.Settings), places)
+        except Exception as error:  # whatever its settings are
+            raise InputError(f"{word}: its settings cannot be shown: {type(error).__name__}: {error}") from error
+        found.append(replace(table, driver="external"))
     return found
 
 
@@ -185,9 +189,7 @@ def _range(field: Any) -> str:
         return ", ".join(str(value) for value in field.get("enum", [field.get("const")]))
     kind = field.get("type", "")
     if kind in ("number", "integer"):
-        low = f"above {field['exclusiveMinimum']:g}" if "exclusiveMinimum" in field else f"{field['minimum']:g}"
-        high = f"below {field['exclusiveMaximum']:g}" if "exclusiveMaximum" in field else f"{field['maximum']:g}"
-        return f"{low} .. {high}" + (", whole" if kind == "integer" else "")
+        return _limits(field) + (", whole" if kind == "integer" else "")
     if kind == "array":
         parts = field.get("prefixItems")
         return f"{len(parts)} x ({_range(parts[0])})" if parts else f"list of {_range(field['items'])}"
@@ -196,6 +198,17 @@ def _range(field: Any) -> str:
     if "pattern" in field:
         return f"text like {field['pattern']}"
     return "a table" if "$ref" in field or "oneOf" in field else "a file" if field.get("format") == "path" else "text"
+
+
+def _limits(field: Any) -> str:
+    """Return the limits of a number; a key of another package may lack one or both."""
+    lows = [f"above {field['exclusiveMinimum']:g}"] if "exclusiveMinimum" in field else []
+    lows += [f"{field['minimum']:g}"] if "minimum" in field else []
+    highs = [f"below {field['exclusiveMaximum']:g}"] if "exclusiveMaximum" in field else []
+    highs += [f"{field['maximum']:g}"] if "maximum" in field else []
+    if not lows and not highs:
+        return "any number"
+    return f"{lows[0] if lows else 'any'} .. {highs[0] if highs else 'any'}"
 
 
 def _shown(default: Any) -> str:

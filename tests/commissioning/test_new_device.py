@@ -82,13 +82,14 @@ def gauge(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_what_is_written_passes_its_own_tests_and_the_linter(tmp_path: Path) -> None:
     """For each kind of role, and for names whose lines are short and long."""
     names = {"displacement": "an_instrument_of_a_longer_name", "barometer": "b2", "vent": "v"}
+    names |= {"camera": "a_photographic_device_of_thirt", "screen": "s"}
     made = [written(tmp_path, name, role) for role, name in names.items()]
     tool(sys.executable, "-m", "ruff", "check", *made, cwd=tmp_path)
     tool(sys.executable, "-m", "ruff", "format", "--check", *made, cwd=tmp_path)
     where = os.pathsep.join(map(str, made))
     config = ["-p", "no:cacheprovider", "-q", "-c", made[0] / "pyproject.toml", "--rootdir", tmp_path]
     told = tool(sys.executable, "-m", "pytest", *config, *made, cwd=tmp_path, path=where)
-    assert "24 passed" in told
+    assert "62 passed" in told
 
 
 class StillPlant:
@@ -299,7 +300,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("role", ["displacement", "gauge_pressure", "pump", "thermometer"])
+@pytest.mark.parametrize("role", ["displacement", "gauge_pressure", "pump", "thermometer", "camera", "screen"])
 def test_a_newcomer_installs_types_and_holds(role: str, tmp_path: Path) -> None:
     """docs/new-device.md, in an environment and a folder of its own."""
     tool(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv", cwd=tmp_path)

@@ -156,7 +156,7 @@ def test_less_than_the_whole_mirror_is_a_warning_and_unused_optics_are_not_judge
     assert findings(60.0) == [("warning", field)]
     assert findings(30.0) == [("error", field)]
     assert findings(30.0, shape={"enabled": False}) == []
-    screen = {"display": 0, "width_px": 1920, "height_px": 1080, "pixel_mm": 0.4961}
+    screen = {"driver": "pygame", "width_px": 1920, "height_px": 1080, "pixel_mm": 0.4961}
     devices = {"board": "tcp://192.0.2.1", "camera": {"driver": "aravis"}, "screen": screen}
     assert ("error", field) in findings(30.0, shape={"enabled": False}, devices=devices)
     assert findings(80.9, twin={"geometry": SHORT | {"alpha_deg": 30.0}}) == [("error", "twin.geometry.alpha_deg")]
