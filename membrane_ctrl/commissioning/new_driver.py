@@ -68,8 +68,9 @@ def write_package(name: str, role: str, folder: Path) -> int:
         for file, template in files.items():
             text = _of_kind((_TEMPLATES / template).read_text(encoding="utf-8"), kind)
             (target / file).write_text(string.Template(text).substitute(words), encoding="utf-8")
+    page = "docs/new-camera.md" if role in _OPTICS else "docs/new-device.md"
     typer.echo(
-        f"{target}: a driver, its emulator, its tests and lab.toml are written. Next (docs/new-device.md):\n"
+        f"{target}: a driver, its emulator, its tests and lab.toml are written. Next ({page}):\n"
         f"  pip install --no-deps --editable {target}\n"
         f"  python -m pytest {target}\n"
         f"  membrane-ctrl hold --twin --devices {target / 'lab.toml'} --duration 1m",
