@@ -90,10 +90,11 @@ board-hold: $(STAMP)  ## the twin's film held for ten minutes by the firmware in
 fuzz: $(STAMP)  ## mutated run folders and capture sets through every command that reads them (20 minutes)
 	$(BIN)/python tests/fuzz/fuzz_folders.py
 
-generate: $(STAMP)  ## the files made from firmware_iface/registers.toml, the safety table, the events and the configuration's schema
+generate: $(STAMP)  ## the files made from registers.toml, the tables of safety, events and telemetry, and the configuration's schema
 	$(BIN)/python -m firmware_iface.generate
 	$(BIN)/python -m tests.support.faults_page
 	$(BIN)/python -m tests.support.events_page
+	$(BIN)/python -m tests.support.telemetry_pages
 	$(BIN)/membrane-ctrl config reference > docs/configuration.md
 
 notebooks: $(STAMP)  ## runs docs/notebooks and stores what they print and draw

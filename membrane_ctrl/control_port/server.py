@@ -28,6 +28,7 @@ from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.instruments.lock_store import draw_word
 from membrane_ctrl.model import errors, events, run_events, telemetry
+from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.run_status import RunStatus
 
@@ -346,17 +347,19 @@ class Port:
 
 
 # Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names carry the units
-# (`membrane_error_um`), as in alarms and telemetry.
+# (`membrane_error_um`), as in alarms and telemetry. Counts that only grow have other names, as Prometheus wants it.
 
 _REQUEST_S = 2.0
-_COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
+COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
 def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
     """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
     lines: list[str] = []
 
-    def add(name: str, kind: str, *samples: tuple[str, float]) -> None:
+    def add(name: str, kind: str, *samples: tuple[str, float], about: str = "") -> None:
+        if about:
+            lines.append(f"# HELP membrane_{name} {about}")
         lines.append(f"# TYPE membrane_{name} {kind}")
         lines.extend(f"membrane_{name}{labels} {_number(value)}" for labels, value in samples)
 
@@ -367,9 +370,11 @@ def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
     row = status.row
     if row is not None:
         add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State))
-        for field, value in asdict(row).items():
-            counter = _COUNTERS.get(field)
-            add(counter or field, "counter" if counter else "gauge", ("", value))
+        for each in COLUMNS.values():
+            counter = COUNTERS.get(each.name)
+            about = f"{each.title}: {each.description}"
+            kind = "counter" if counter else "gauge"
+            add(counter or each.name, kind, ("", getattr(row, each.name)), about=about)
     return "\n".join(lines) + "\n"
 
 

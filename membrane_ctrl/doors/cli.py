@@ -48,11 +48,9 @@ def doors(
 @app.command()
 def names() -> None:
     """Print the published names with their units, as a Markdown table."""
-    from membrane_ctrl.doors.names import TABLE
+    from membrane_ctrl.doors.names import TABLE, table_lines
 
-    print("| name | unit | what |\n|---|---|---|")
-    for each in TABLE:
-        print(f"| `{each.name}` | {'text' if each.is_text else each.unit or '1'} | {each.description} |")
+    print("\n".join(table_lines(TABLE)))
 
 
 async def _serve(door: Door) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,15 @@ _TEXTS = (
     Published("answer", "what became of the last command of any door", is_text=True),
 )
 TABLE = (*_TEXTS, *_TICK, *_FIGURE)
+
+
+def table_lines(published: Sequence[Published]) -> list[str]:
+    """Return published values as the lines of a Markdown table."""
+    rows = [
+        f"| `{each.name}` | {'text' if each.is_text else each.unit or '1'} | {each.description} |"
+        for each in published
+    ]
+    return ["| name | unit | what |", "|---|---|---|", *rows]
 
 
 def values(seen: HoldSeen) -> dict[str, Value]:

@@ -311,7 +311,7 @@ class ColumnValues:
         aggregation=_EXTREMES,
     )
     flow_wanted_um_per_s: float = column(
-        "flow wanted", "flow that the loop asks for, before its limits", FLOW, "/loop/flow", colour=GREY, decimals=3
+        "flow wanted", "flow that the loop asks for; what exceeds the flow is beyond its limits", FLOW, "/loop/flow", colour=GREY, decimals=3
     )
     flow_um_per_s: float = column(
         "flow", "the pump's flow, as motion of the centre", FLOW, "/loop/flow", decimals=3, published=True
@@ -365,7 +365,7 @@ class ColumnValues:
     )
     displacement_quality: float = column(
         "displacement quality",
-        "quality code of the laser's reading; 0 is good",
+        "quality code of the laser's reading; 0 is good, missing where the optics hold without a laser",
         RECORD,
         "/tick/record",
         colour=RED,

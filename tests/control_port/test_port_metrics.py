@@ -20,7 +20,7 @@ SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 
 def test_every_line_is_one_that_prometheus_reads() -> None:
     text = metrics_text(RunStatus(row=replace(ROW, trim_um=nan)), 2, 7)
-    samples = [line for line in text.splitlines() if not line.startswith("# TYPE membrane_")]
+    samples = [line for line in text.splitlines() if not line.startswith(("# TYPE membrane_", "# HELP membrane_"))]
     assert all(SAMPLE.fullmatch(line) for line in samples)
     assert "membrane_error_um 0.25" in samples
     assert "membrane_trim_um NaN" in samples

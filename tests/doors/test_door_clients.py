@@ -271,7 +271,7 @@ async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
             await told(port, f"{base}/do/setpoint", "1.5")
             assert (await answer()).endswith("mqtt: setpoint: done")
             for command, text, says in (
-                ("setpoint", "nan", f"mqtt: Setpoint: enter a number in um: 'nan' {NO_NUMBER}"),
+                ("setpoint", "nan", f"mqtt: Setpoint: enter a number in µm: 'nan' {NO_NUMBER}"),
                 ("open_the_roof", "", "mqtt: no such command"),
                 ("mark", "x" * 100_000, "mqtt: mark refused: longer than 500 bytes"),
             ):
@@ -327,8 +327,8 @@ async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
     async with held(tmp_path) as run, doors(tmp_path, SERVERS.format(**ports)):
         finite = "Setpoint: enter a finite number in µm"
         assert await said_by(HOSTILE_OPCUA, ports) == {
-            "nan": finite, "text": f"Setpoint: enter a number in um: 'abc' {NO_NUMBER}",
-            "none": f"Setpoint: enter a number in um: '' {NO_NUMBER}",
+            "nan": finite, "text": f"Setpoint: enter a number in µm: 'abc' {NO_NUMBER}",
+            "none": f"Setpoint: enter a number in µm: '' {NO_NUMBER}",
             **dict.fromkeys(("two", "array", "bytes"), "BadInvalidArgument"),
             "huge": "setpoint refused: longer than 500 bytes",
             **dict.fromkeys(("add", "delete", "shut", "unit"), "BadUserAccessDenied"),

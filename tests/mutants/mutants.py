@@ -52,7 +52,12 @@ ALL_FAST = tuple(
     )
 )
 # These compare a generated document with its source: any change of the source would count as noticed ...
-COMPARISONS = ("test_configuration_page.py", "test_faults_page.py", "test_register_generate.py")
+COMPARISONS = (
+    "test_configuration_page.py",
+    "test_faults_page.py",
+    "test_register_generate.py",
+    "test_telemetry_pages.py",
+)
 # ... and this one waits for real devices' time-outs: on a busy machine it fails without a mutation.
 _OF_TIME = ("test_examples.py",)
 _LEAVE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".mypy_cache", ".ruff_cache", "logs", "images")
