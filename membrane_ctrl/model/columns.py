@@ -74,8 +74,11 @@ class Group(Enum):
     ENVIRONMENT = "Gas and air"
     SHAPE = "Shape"
     TIMING = "Timing"
-    STATE = "State"
+    STATE = "State"  # drawn as lanes of words
     RECORD = "Record"  # for programs rather than people: in no plot
+
+
+DRAWN = tuple(group for group in Group if group not in (Group.STATE, Group.RECORD))
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +314,12 @@ class ColumnValues:
         aggregation=_EXTREMES,
     )
     flow_wanted_um_per_s: float = column(
-        "flow wanted", "flow that the loop asks for; what exceeds the flow is beyond its limits", FLOW, "/loop/flow", colour=GREY, decimals=3
+        "flow wanted",
+        "flow that the loop asks for; what exceeds the flow is beyond its limits",
+        FLOW,
+        "/loop/flow",
+        colour=GREY,
+        decimals=3,
     )
     flow_um_per_s: float = column(
         "flow", "the pump's flow, as motion of the centre", FLOW, "/loop/flow", decimals=3, published=True
@@ -486,6 +494,11 @@ def plots_of(*groups: Group) -> tuple[Plot, ...]:
 def columns_of(plot: Plot) -> tuple[TelemetryColumn, ...]:
     """Return the columns that a plot shows, in the order of the table."""
     return tuple(each for each in EVERY_COLUMN.values() if each.plot == plot)
+
+
+def aggregated_of(plot: Plot) -> tuple[TelemetryColumn, ...]:
+    """Return the columns of a plot whose minimum, mean and maximum overview levels keep."""
+    return tuple(each for each in columns_of(plot) if each in AGGREGATED)
 
 
 def plot_title(plot: Plot, detail: str = "") -> str:

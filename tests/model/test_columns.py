@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 
-from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Group, Kind, TelemetryColumn, unit_of
+from membrane_ctrl.model.columns import COLUMNS, DRAWN, TRUE_ERROR_COLUMN, Aggregation, Kind, TelemetryColumn, unit_of
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 EVERY = [*COLUMNS.values(), TRUE_ERROR_COLUMN]
@@ -51,7 +51,7 @@ def test_the_suffix_of_an_identifier_gives_the_unit(name: str, unit: str) -> Non
 def test_columns_of_one_plot_have_one_unit() -> None:
     units = defaultdict(set)
     for each in EVERY:
-        if each.plot.group not in (Group.RECORD, Group.STATE):
+        if each.plot.group in DRAWN:
             units[each.plot].add(each.unit)
     assert {plot.title: found for plot, found in units.items() if len(found) > 1} == {}
 
@@ -59,7 +59,7 @@ def test_columns_of_one_plot_have_one_unit() -> None:
 def test_columns_of_one_entity_are_in_one_plot_or_recorded_for_programs() -> None:
     plots = defaultdict(set)
     for each in EVERY:
-        if each.plot.group not in (Group.RECORD, Group.STATE):
+        if each.plot.group in DRAWN:
             plots[each.entity].add(each.plot)
     assert all(len(found) == 1 for found in plots.values())
     assert [each.name for each in EVERY if not each.entity] == ["mono_s"], "the time axis alone"

@@ -38,8 +38,8 @@ _INTRODUCTION = """\
 
 Generated from `membrane_ctrl/model/columns.py` by `python -m tests.support.telemetry_pages`. Each tick gives a row of
 these columns: in the run's tables ([recording](recording.md)), in the viewer, and as `membrane_<column>` for
-[Prometheus](control-port.md#metrics). A name ends in its unit: `_um` is µm. A value that is not known is missing (NaN,
-or null in tables).
+[Prometheus](control-port.md#metrics). A name ends in its unit: `_um` is µm. A value that is not known is missing: it
+is NaN, or null in tables.
 
 *Overview* is what the tables of 1, 10 and 60 s keep. *Shown* columns are on the [page](web.md), on the console, in
 `ctl status`, in the dashboard and in the [bridges](doors.md). *Entity* is the path in the [viewer](rerun.md).

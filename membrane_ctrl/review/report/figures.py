@@ -1,6 +1,7 @@
-"""Pictures of the hold: the run at a glance, surroundings, distributions."""
+"""Pictures of the hold: the run at a glance, everything else over time, distributions."""
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +12,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import colours, events, run_events
 from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.colours import Colour
+from membrane_ctrl.model.columns import DRAWN, ERROR, TelemetryColumn, aggregated_of, columns_of, plot_title, plots_of
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from membrane_ctrl.review.catalogue import one_line, span
@@ -50,6 +53,16 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "membrane",
     "svg.fonttype": "none",
 }
+
+
+# Colours that are too pale on white.
+_DARKER: dict[Colour, str] = {colours.BLUE: BLUE, colours.WHITE: "#444b55", colours.YELLOW: "#a89b00"}
+
+
+def on_white(colour: Colour) -> str:
+    """Return a colour of the table of columns for a white background."""
+    red, green, blue = colour
+    return _DARKER.get(colour, f"#{red:02x}{green:02x}{blue:02x}")
 
 
 @contextmanager
@@ -168,33 +181,39 @@ def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
     lane.grid(False)
 
 
-def surroundings(analysis: Analysis) -> str:
-    """Air, leak and pump, lateness."""
+def everything_else(analysis: Analysis) -> str:
+    """Position, flow, pump, gas, air, trim, timing: each plot of the table of columns that the run has values for."""
     level = broken_at_gaps(analysis.level)
     time, unit = hours_or_less(level["time_s"], analysis.ticks.end_s - analysis.ticks.start_s)
-    with picture(2, 2, 4.2, sharex=True) as (figure, plots):
-        pressure, temperature, flow, late = plots.ravel()
-        _envelope(pressure, time, level, "ambient_pressure_pa", BLUE)
-        pressure.set(title="Ambient pressure, Pa")
-        pressure.ticklabel_format(useOffset=False)
-        _envelope(temperature, time, level, "air_temperature_c", ORANGE)
-        temperature.set(title="Air temperature, °C")
-        flow.plot(time, level["mean_flow_um_per_s"], color=GREY, lw=0.8, label="flow")
-        flow.plot(time, level["mean_leak_um_per_s"], color=RED, label="leak")
-        flow.set(title="Flow and leak, µm/s", xlabel=unit)
-        flow.legend(loc="upper right", ncols=2)
-        late.plot(time, level["max_lateness_ms"], color=GREY, lw=0.8, label="maximum")
-        late.plot(time, level["mean_lateness_ms"], color=BLUE, label="mean")
-        late.set(title="Lateness of the tick, ms", xlabel=unit)
-        if np.nanmax(level["max_lateness_ms"], initial=0.0) > 0:
-            late.set_yscale("log")
-        late.legend(loc="upper right", ncols=2)
+    plots = {plot: [each for each in aggregated_of(plot) if _has_values(level, each)] for plot in plots_of(*DRAWN)}
+    shown = {plot: columns for plot, columns in plots.items() if columns and plot != ERROR}
+    rows = max(1, math.ceil(len(shown) / 2))
+    with picture(rows, 2, 2.1 * rows, sharex=True, squeeze=False) as (figure, axes):
+        for axis, (plot, columns) in zip(axes.flat, shown.items(), strict=False):
+            _draw_columns(axis, time, level, columns)
+            axis.set_title(plot_title(plot))
+        for axis in axes.flat[len(shown) :]:
+            axis.set_axis_off()
+        for axis in axes[-1]:
+            axis.set_xlabel(unit)
         return svg(figure)
 
 
-def _envelope(plot: Any, time: Column, level: dict[str, Column], name: str, colour: str) -> None:
-    plot.fill_between(time, level[f"min_{name}"], level[f"max_{name}"], color=colour, alpha=0.2, lw=0)
-    plot.plot(time, level[f"mean_{name}"], color=colour)
+def _has_values(level: Mapping[str, Column], each: TelemetryColumn) -> bool:
+    return bool(np.isfinite(level[f"mean_{each.name}"]).any())
+
+
+def _draw_columns(axis: Any, time: Column, level: Mapping[str, Column], columns: Sequence[TelemetryColumn]) -> None:
+    """Draw the means of columns of one plot; of a single one minimum and maximum, too."""
+    for each in columns:
+        axis.plot(time, level[f"mean_{each.name}"], color=on_white(each.colour), label=each.short_label)
+    if len(columns) == 1:
+        (each,) = columns
+        lowest, highest = level[f"min_{each.name}"], level[f"max_{each.name}"]
+        axis.fill_between(time, lowest, highest, color=on_white(each.colour), alpha=0.2, lw=0)
+    if len(columns_of(columns[0].plot)) > 1:
+        axis.legend(loc="upper right", ncols=len(columns))
+    axis.ticklabel_format(useOffset=False)
 
 
 def distributions(analysis: Analysis) -> str:

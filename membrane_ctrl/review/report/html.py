@@ -77,7 +77,7 @@ def render(
         _section("Hold quality", _windows(analysis) + _details(analysis)),
         f"<figure>{figures.distributions(analysis)}</figure>",
         _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
-        f"<figure>{figures.surroundings(analysis)}</figure>",
+        f"<figure>{figures.everything_else(analysis)}</figure>",
     ]
     if analysis.shape is not None:
         parts.append(_section("Figure", _shape(analysis.shape)))

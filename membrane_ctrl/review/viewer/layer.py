@@ -15,7 +15,7 @@ import rerun as rr
 from membrane_ctrl.model import events
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
-from membrane_ctrl.model.columns import AGGREGATED, Group, Plot, columns_of, plots_of
+from membrane_ctrl.model.columns import DRAWN, Plot, aggregated_of, plots_of
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, changes
@@ -43,7 +43,7 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
 
     Each column of the plot that levels keep gives a line of its means; a single one gives minimum and maximum, too.
     """
-    kept = [each for each in columns_of(plot) if each in AGGREGATED]
+    kept = aggregated_of(plot)
     alone = sum(not each.twin_only for each in kept) == 1
     by_entity: dict[str, list[streams.Line]] = {}
     for each in kept:
@@ -55,7 +55,7 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
 
 
 _EXTREMES = {"min": "minimum", "max": "maximum"}
-OVERVIEWS = tuple(stream for plot in plots_of(*Group) for stream in overview_streams(plot))
+OVERVIEWS = tuple(stream for plot in plots_of(*DRAWN) for stream in overview_streams(plot))
 
 _COLOUR_WORDS = (
     "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
