@@ -89,6 +89,8 @@ class AravisCamera:
 
         Raises LinkError without a camera.
         """
+        if self._pending is not None and self._stream is not None:
+            self._discard_pending()
         if self._stream is None:
             self.open()
         library = arv.aravis()
@@ -254,6 +256,17 @@ class AravisCamera:
             library.call("arv_camera_stop_acquisition", self._camera)
         library.call("g_object_unref", self._stream)
         self._stream = None
+
+    def _discard_pending(self) -> None:
+        """Wait for the frame of an exposure that was not fetched: later it would answer the next trigger."""
+        self._pending = None
+        library = arv.aravis()
+        timeout_us = round(1e6 * self.config.timeout_s)
+        buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
+        if buffer:
+            library.call("arv_stream_push_buffer", self._stream, buffer)
+        else:
+            self._restart()
 
     def _restart(self) -> None:
         """A new stream to the same camera; a new connection if that fails (at the next exposure)."""

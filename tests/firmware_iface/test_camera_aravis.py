@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_iface import camera_conformance
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.links import aravis
-from firmware_iface.roles import DeviceRefusedError, FrameLostError, LinkDownError, LinkError, SensorFormat
+from firmware_iface.roles import (
+    DeviceRefusedError,
+    DriverClock,
+    FrameLostError,
+    LinkDownError,
+    LinkError,
+    SensorFormat,
+)
 from firmware_iface.settings import AravisCameraConfig
 from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.machine_needs import program_path
@@ -33,9 +41,10 @@ def guarded(config: AravisCameraConfig = SETTINGS, width_px: int = WIDTH_PX) -> 
 
 
 class Sight:
-    """Every exposure is another picture; the last one is kept."""
+    """Every exposure is another picture, or what `view` returns; the last one is kept."""
 
     def __init__(self) -> None:
+        self.view: Any = None
         self.dtype: Any = np.uint8
         self.top = 256
         self.generator = np.random.default_rng(7)
@@ -44,6 +53,8 @@ class Sight:
 
     def expose(self, exposure_ms: float, gain: int) -> Any:
         self.seen.append((exposure_ms, gain))
+        if self.view is not None:
+            return self.view()
         self.last = self.generator.integers(0, self.top, (HEIGHT_PX, WIDTH_PX)).astype(self.dtype)
         return self.last
 
@@ -58,6 +69,40 @@ def emulator(sight: Sight) -> Iterator[GigeCameraEmulator]:
     with gige_camera(sight.expose, WIDTH_PX, HEIGHT_PX) as emulated:
         yield emulated
     assert emulated.error is None
+
+
+class Bench(camera_conformance.CameraBench):
+    """The emulated camera sees what the conformance checks show it."""
+
+    sensor = SensorFormat(WIDTH_PX, HEIGHT_PX)
+    exposure_s = SETTINGS.exposure_ms / 1000.0
+
+    def __init__(self, emulator: GigeCameraEmulator, sight: Sight) -> None:
+        super().__init__()
+        self.clock = DriverClock()
+        self._emulator, self._sight = emulator, sight
+        sight.view = self.view
+
+    def make(self, sensor: SensorFormat) -> AravisCamera:
+        return AravisCamera(SETTINGS, sensor, self.clock)
+
+    def change_scene(self) -> Any:
+        self._emulator.lose_packets(0.0)
+        return super().change_scene()
+
+    def lose_frame(self) -> None:
+        self._emulator.lose_packets(1.0)
+
+    def unplug(self) -> None:
+        self._emulator.unplug()
+
+    def plug_in(self) -> None:
+        self._emulator.plug_in()
+
+
+@pytest.mark.parametrize("check", camera_conformance.list_checks(Bench), ids=lambda check: check.__name__)
+def test_conformance(check: camera_conformance.Check, emulator: GigeCameraEmulator, sight: Sight) -> None:
+    check(Bench(emulator, sight))
 
 
 @pytest.fixture

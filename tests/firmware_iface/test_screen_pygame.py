@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from firmware_iface import display_conformance
 from firmware_iface.display import DisplayResponse, ScreenRaster, checkerboard, pattern_light
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.pattern_screen import PatternScreen
@@ -50,6 +52,35 @@ def made(time: Time, raster: ScreenRaster = RASTER, display: int = 0) -> Pattern
     size = {"width_px": raster.width_px, "height_px": raster.height_px, "pixel_mm": raster.pixel_mm}
     shown = PygameDisplay(PygameScreenConfig(**size, display=display))
     return PatternScreen(shown, raster, PATTERNS, DriverClock(time.now, time.sleep), "screen pygame")
+
+
+class PhotographedDisplay(PygameDisplay):
+    """A display whose pixels are read back after every picture."""
+
+    def __init__(self, config: PygameScreenConfig, framebuffer: Path, light: Callable[[np.ndarray], None]) -> None:
+        super().__init__(config)
+        self._framebuffer, self._light = framebuffer, light
+
+    def show(self, picture: Any) -> None:
+        super().show(picture)
+        self._light(screenshot(self._framebuffer)[:, :, 1])
+
+
+class Bench(display_conformance.DisplayBench):
+    width_px, height_px = WIDTH_PX, HEIGHT_PX
+
+    def __init__(self, framebuffer: Path) -> None:
+        super().__init__()
+        self._framebuffer = framebuffer
+
+    def make(self, width_px: int, height_px: int) -> PhotographedDisplay:
+        config = PygameScreenConfig(width_px=width_px, height_px=height_px, pixel_mm=0.25)
+        return PhotographedDisplay(config, self._framebuffer, self.light)
+
+
+@pytest.mark.parametrize("check", display_conformance.list_checks(Bench), ids=lambda check: check.__name__)
+def test_conformance(check: display_conformance.Check, framebuffer: Path) -> None:
+    check(Bench(framebuffer))
 
 
 @pytest.fixture
