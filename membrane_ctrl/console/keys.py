@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.control_port.client import PortClient
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.model import errors, terminal
 
@@ -111,11 +112,11 @@ def ask(socket: Path, run: str, request: Request) -> str:
     try:
         with PortClient.unix(socket, notice=lambda _: None) as client:
             if client.greeting.get("run") != run:
-                return f"{what}: {socket}: another run listens there"
+                return Outcome.failed(what, f"{socket}: another run listens there").text
             answer = client.ask(**request, why="key")
     except errors.DeviceError as error:
-        return f"{what}: {error}"
-    return f"{what}: done" if answer.get("ok") else f"{what} refused: {answer.get('refused')}"
+        return Outcome.failed(what, str(error)).text
+    return Outcome.from_answer(what, answer).text
 
 
 HELP = (

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from membrane_ctrl.control_port.fair_queue import FairQueue
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.doors.hold_link import SendLimits
 
@@ -33,8 +34,8 @@ SAFETY_ANSWER_S = 0.9
 _SHARED_MOST = 64  # senders that share the answer to one safety command
 
 Message = dict[str, Any]
-SendCommand = Callable[[Message, SendLimits], str]
-ReportLate = Callable[[str], None]
+SendCommand = Callable[[Message, SendLimits], Outcome]
+ReportLate = Callable[[Outcome], None]
 
 MOVES_NOTHING = frozenset({"mark", "quiet"})
 
@@ -45,7 +46,7 @@ class WaitingCommand:
 
     request: Message
     deadline_s: float
-    outcomes: list[asyncio.Future[str]] = field(default_factory=list)
+    outcomes: list[asyncio.Future[Outcome]] = field(default_factory=list)
 
     @property
     def kind(self) -> str:
@@ -57,11 +58,11 @@ class WaitingCommand:
         """Whether all senders have an answer."""
         return all(outcome.done() for outcome in self.outcomes)
 
-    def answer(self, text: str) -> None:
+    def answer(self, result: Outcome) -> None:
         """Answer all senders that have no answer yet."""
         for outcome in self.outcomes:
             if not outcome.done():
-                outcome.set_result(text)
+                outcome.set_result(result)
 
 
 class CommandLanes:
@@ -85,9 +86,9 @@ class CommandLanes:
         self._newest_safety = ""
         self._safety_count = 0
 
-    def submit(self, request: Message) -> asyncio.Future[str]:
-        """Accept or refuse a command at once; the future holds what became of it, in one line."""
-        outcome: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    def submit(self, request: Message) -> asyncio.Future[Outcome]:
+        """Accept or refuse a command at once; the future holds what became of it."""
+        outcome: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         if is_safety_command(str(request["do"])):
             self._submit_safety(request, outcome)
         else:
@@ -103,18 +104,19 @@ class CommandLanes:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _submit_ordinary(self, request: Message, outcome: asyncio.Future[str]) -> None:
+    def _submit_ordinary(self, request: Message, outcome: asyncio.Future[Outcome]) -> None:
+        kind = str(request["do"])
         if len(self._ordinary) >= ORDINARY_MOST:
-            outcome.set_result(f"{request['do']} refused: too many commands at once: {ORDINARY_MOST} wait already")
+            outcome.set_result(Outcome.refused(kind, f"too many commands at once: {ORDINARY_MOST} wait already"))
             return
         waiting = WaitingCommand(request, time.monotonic() + TIME_LIMIT_S, [outcome])
-        late = f"{request['do']} refused: not obeyed within {TIME_LIMIT_S:g} s, and will not be later; send again"
+        late = Outcome.refused(kind, f"not obeyed within {TIME_LIMIT_S:g} s, and will not be later; send again")
         asyncio.get_running_loop().call_later(TIME_LIMIT_S, waiting.answer, late)
         self._ordinary.append(waiting)
         if self._ordinary_task is None or self._ordinary_task.done():
             self._ordinary_task = asyncio.create_task(self._serve_ordinary(), name="bridge commands")
 
-    def _submit_safety(self, request: Message, outcome: asyncio.Future[str]) -> None:
+    def _submit_safety(self, request: Message, outcome: asyncio.Future[Outcome]) -> None:
         kind = str(request["do"])
         self._refuse_waiting(kind)
         asyncio.get_running_loop().call_later(SAFETY_ANSWER_S, _answer_provisionally, outcome, kind)
@@ -124,11 +126,13 @@ class CommandLanes:
                 if len(waiting.outcomes) < _SHARED_MOST:
                     waiting.outcomes.append(outcome)
                 else:
-                    outcome.set_result(f"{kind}: the same command of {_SHARED_MOST} others is being sent")
+                    shared = f"the same command of {_SHARED_MOST} others is being sent"
+                    outcome.set_result(Outcome.failed(kind, shared))
                 return
         waiting = WaitingCommand(request, float("inf"), [outcome])
         if not self._safety.put(kind, waiting):
-            outcome.set_result(f"{kind} refused: {SAFETY_MOST_EACH} with other texts wait already; send again")
+            full = f"{SAFETY_MOST_EACH} with other texts wait already; send again"
+            outcome.set_result(Outcome.refused(kind, full))
             return
         if self._safety_task is None or self._safety_task.done():
             self._safety_task = asyncio.create_task(self._serve_safety(), name="bridge safety commands")
@@ -139,7 +143,7 @@ class CommandLanes:
         self._safety_count += 1
         for waiting in self._ordinary:
             if waiting.kind not in MOVES_NOTHING:
-                waiting.answer(f"{waiting.kind} refused: {overtaken(winner)}")
+                waiting.answer(Outcome.refused(waiting.kind, overtaken(winner)))
 
     async def _serve_ordinary(self) -> None:
         while self._ordinary:
@@ -167,30 +171,31 @@ class CommandLanes:
                 self._report_late(outcome)
             waiting.answer(outcome)
 
-    async def _send_on_thread(self, request: Message, limits: SendLimits) -> str:
+    async def _send_on_thread(self, request: Message, limits: SendLimits) -> Outcome:
         """Send on a thread of its own, which ends with the process: a hold that hangs must not delay the exit."""
         loop = asyncio.get_running_loop()
-        outcome: asyncio.Future[str] = loop.create_future()
+        outcome: asyncio.Future[Outcome] = loop.create_future()
 
-        def set_outcome(text: str) -> None:
+        def set_outcome(result: Outcome) -> None:
             if not outcome.done():
-                outcome.set_result(text)
+                outcome.set_result(result)
 
         def send() -> None:
             try:
-                text = self._send(request, limits)
+                result = self._send(request, limits)
             except Exception as error:  # nothing else would see an exception of this thread
-                text = f"{request['do']}: not sent: {type(error).__name__}: {error}"
+                result = Outcome.failed(str(request["do"]), f"not sent: {type(error).__name__}: {error}")
             with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
-                loop.call_soon_threadsafe(set_outcome, text)
+                loop.call_soon_threadsafe(set_outcome, result)
 
         threading.Thread(target=send, name="bridge command", daemon=True).start()
         return await outcome
 
 
-def _answer_provisionally(outcome: asyncio.Future[str], kind: str) -> None:
+def _answer_provisionally(outcome: asyncio.Future[Outcome], kind: str) -> None:
     if not outcome.done():
-        outcome.set_result(f"{kind}: no answer from the hold within {SAFETY_ANSWER_S:g} s; still being sent")
+        late = f"no answer from the hold within {SAFETY_ANSWER_S:g} s; still being sent"
+        outcome.set_result(Outcome.failed(kind, late))
 
 
 def overtaken(winner: str) -> str:

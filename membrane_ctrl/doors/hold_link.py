@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from membrane_ctrl.control_port.ctl import Where, connected
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.model import errors
 
@@ -22,8 +23,8 @@ class SendLimits:
     refusal: Callable[[], str]  # why it must not be sent any more; empty if it may
 
 
-def send_command(where: Where, run: str, request: Message, limits: SendLimits) -> str:
-    """Send a command to the run named `run`; returns what became of it, in one line.
+def send_command(where: Where, run: str, request: Message, limits: SendLimits) -> Outcome:
+    """Send a command to the run named `run`; returns what became of it.
 
     A hold that hangs does not greet, so nothing is sent to it that it could obey a minute later. If it hangs between
     greeting and tick, it refuses the command by its time limit. Safety commands have none of these conditions.
@@ -34,14 +35,14 @@ def send_command(where: Where, run: str, request: Message, limits: SendLimits) -
         with connected(where, notice=_ignore_notice) as client:
             if not is_safety_command(kind):
                 if client.greeting.get("run") != run:
-                    return f"{what}: not sent: another run is listening now; look again"
+                    return Outcome.failed(what, "not sent: another run is listening now; look again")
                 if reason := _late_reason(limits):
-                    return f"{what} refused: {reason}"
+                    return Outcome.refused(what, reason)
                 request = request | _expiry(client.greeting, limits.deadline_s)
             answer = client.ask(**request)
     except errors.CommandError as error:
-        return f"{what}: {'; '.join(error.lines)}"
-    return f"{what}: done" if answer.get("ok") else f"{what} refused: {answer.get('refused')}"
+        return Outcome.failed(what, "; ".join(error.lines))
+    return Outcome.from_answer(what, answer)
 
 
 def _late_reason(limits: SendLimits) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import TEXT_BYTES
 from membrane_ctrl.control_port.safety_commands import is_safety_command
 from membrane_ctrl.control_port.status import fault_line, lock_lines, notice_lines
@@ -168,13 +169,13 @@ class Door:
         try:
             asked = self._request(by, name, given, role or self.settings.role, who)
         except ValueError as error:
-            outcome: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-            outcome.set_result(str(error))
+            outcome: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+            outcome.set_result(Outcome(name, str(error)))
         else:
             outcome = self._lanes.submit(asked)
         answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
-        def note(done: asyncio.Future[str]) -> None:
+        def note(done: asyncio.Future[Outcome]) -> None:
             if not answer.done():
                 answer.set_result(self._noted(by, name, done.result()))
 
@@ -188,23 +189,23 @@ class Door:
         """End what is under way."""
         await self._lanes.close()
 
-    def _noted(self, by: str, name: str, outcome: str) -> str:
+    def _noted(self, by: str, name: str, outcome: Outcome) -> str:
         """Note an outcome as the value `answer`; refusals of a flood do not replace a safety command's answer."""
-        answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome}"
+        answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome.text}"
         safety = is_safety_command(name)
         now_s = time.monotonic()
-        if safety or now_s - self._safety_answered_s > _SAFETY_SHOWN_S or outcome.endswith(": done"):
+        if safety or now_s - self._safety_answered_s > _SAFETY_SHOWN_S or outcome.done:
             self._answer = answer
         if safety:
             self._safety_answered_s = now_s
         return answer
 
-    def _report_late(self, outcome: str) -> None:
-        answer = self._noted("late", outcome.partition(":")[0].partition(" ")[0], outcome)
+    def _report_late(self, outcome: Outcome) -> None:
+        answer = self._noted("late", outcome.command, outcome)
         for listener in self.late_listeners:
             listener(answer)
 
-    def _send(self, asked: dict[str, Any], limits: SendLimits) -> str:
+    def _send(self, asked: dict[str, Any], limits: SendLimits) -> Outcome:
         return send_command(self._where, self.feed.seen.name, asked, limits)
 
     def _request(self, by: str, name: str, given: Any, role: Role, who: str) -> dict[str, Any]:

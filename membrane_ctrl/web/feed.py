@@ -20,6 +20,7 @@ import numpy as np
 
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.ctl import Where, connected
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import PUBLISHED
@@ -134,21 +135,17 @@ class HoldFeed:
             self._client.close()
         self._thread.join(5.0)
 
-    def ask(self, request: Message) -> str:
-        """Send a request on a connection of its own; returns what became of it, in one line."""
+    def ask(self, request: Message) -> Outcome:
+        """Send a request on a connection of its own; returns what became of it."""
         what = str(request["do"]).replace("_", " ")
         try:
             with connected(self._where, notice=lambda _: None) as client:
                 if client.greeting["run"] != self.seen.name:
-                    return f"{what}: not sent: another run is listening now; look again"
+                    return Outcome.failed(what, "not sent: another run is listening now; look again")
                 answer = client.ask(**request)
         except errors.CommandError as error:
-            return f"{what}: {'; '.join(error.lines)}"
-        if not answer.get("ok"):
-            return f"{what} refused: {answer.get('refused')}"
-        if answer.get("problem"):
-            return f"{what}: not stored, only this run knows: {answer['problem']}"
-        return f"{what}: done"
+            return Outcome.failed(what, "; ".join(error.lines))
+        return Outcome.from_answer(what, answer)
 
     def _follow(self) -> None:
         while not self._ending.is_set():

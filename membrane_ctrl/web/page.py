@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED
 from membrane_ctrl.web import figures
@@ -281,7 +282,7 @@ class WebPage:
             return
         asked["on_behalf"] = on_behalf(self._user, self._session)
         try:
-            said = await pool_of_command(action.do).run(self._feed.ask, asked)
+            outcome = await pool_of_command(action.do).run(self._feed.ask, asked)
         except PoolFullError as error:
-            said = f"{action.label}: not sent: {error}"
-        tell(said, said.endswith(": done"))
+            outcome = Outcome.failed(action.label, f"not sent: {error}")
+        tell(outcome.text, outcome.done)

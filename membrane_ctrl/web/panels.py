@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from nicegui import ui
 
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
@@ -242,20 +243,20 @@ def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
     return head, *(row for row in rows if len(row) == len(head))
 
 
-def answered(session: Path, question: str, given: PageAnswer) -> str:
-    """Give a session an answer; returns what became of it, in one line."""
+def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
+    """Give a session an answer; returns what became of it."""
     what = given.said or "none of them"
     try:
         give_answer(session, question, given)
     except OSError as error:
-        return f"{what}: not given: {errors.os_reason(error)}"
+        return Outcome.failed(what, f"not given: {errors.os_reason(error)}")
     for _ in range(_TAKES):
         if not (session / ANSWER).exists():
-            return f"{what}: done"
+            return Outcome.succeeded(what)
         time.sleep(_LOOK_S)
     with suppress(OSError):
         (session / ANSWER).unlink()
-    return f"{what}: not taken: the session no longer asks; see its terminal"
+    return Outcome.failed(what, "not taken: the session no longer asks; see its terminal")
 
 
 def fresh(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:
@@ -344,4 +345,4 @@ class TuningPanel:
         given = PageAnswer(said, self._user.name)
         outcome = await ANSWERS.run(answered, seen.path, seen.progress.asks, given)
         with self._steps:  # the button that was pressed is gone once the session has its answer
-            tell(outcome, outcome.endswith(": done"))
+            tell(outcome.text, outcome.done)

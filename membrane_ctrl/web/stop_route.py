@@ -30,6 +30,6 @@ def stop_handler(feeds: Mapping[str, HoldFeed]) -> StopHandler:
             outcome = await SAFETY_COMMANDS.run(feed.ask, asked)
         except PoolFullError as error:
             return HTTPStatus.SERVICE_UNAVAILABLE, f"stop: not sent: {error}"
-        return (HTTPStatus.OK if outcome.endswith(": done") else HTTPStatus.CONFLICT), outcome
+        return (HTTPStatus.OK if outcome.done else HTTPStatus.CONFLICT), outcome.text
 
     return stop

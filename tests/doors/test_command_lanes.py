@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
 
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.doors import command_lanes
 from membrane_ctrl.doors.command_lanes import ORDINARY_MOST, SAFETY_MOST_EACH, CommandLanes
@@ -30,7 +31,7 @@ class FakeHold:
         self.most_at_once = 0
         self._lock = threading.Lock()
 
-    def send(self, request: dict[str, Any], limits: SendLimits) -> str:
+    def send(self, request: dict[str, Any], limits: SendLimits) -> Outcome:
         kind = str(request["do"])
         with self._lock:
             self.at_once[kind] = self.at_once.get(kind, 0) + 1
@@ -42,16 +43,20 @@ class FakeHold:
             self.at_once[kind] -= 1
             if not reason:
                 self.sent.append((kind, str(request.get("text", ""))))
-        return f"{kind} refused: {reason}" if reason else f"{kind}: done"
+        return Outcome.refused(kind, reason) if reason else Outcome.succeeded(kind)
 
 
-def lanes_to(hold: FakeHold, late: list[str] | None = None) -> CommandLanes:
+def lanes_to(hold: FakeHold, late: list[Outcome] | None = None) -> CommandLanes:
     return CommandLanes(hold.send, [].append if late is None else late.append)
 
 
-async def outcome_within(outcome: asyncio.Future[str], limit_s: float) -> str:
+async def outcome_within(outcome: asyncio.Future[Outcome], limit_s: float) -> str:
     async with asyncio.timeout(limit_s):
-        return await outcome
+        return (await outcome).text
+
+
+async def texts_of(outcomes: Iterable[asyncio.Future[Outcome]]) -> list[str]:
+    return [outcome.text for outcome in await asyncio.gather(*outcomes)]
 
 
 async def wait_for(condition: Callable[[], bool]) -> None:
@@ -66,7 +71,7 @@ async def test_a_safety_command_overtakes_a_crowd_and_the_crowd_is_answered(kind
     lanes = lanes_to(hold)
     crowd = [lanes.submit({"do": "mark", "text": "x"}) for _ in range(150)]
     assert await outcome_within(lanes.submit({"do": kind}), 0.5) == f"{kind}: done"
-    said = await asyncio.gather(*crowd)
+    said = await texts_of(crowd)
     refused = [each for each in said if "too many commands at once" in each]
     assert len(refused) == 150 - ORDINARY_MOST
     assert hold.most_at_once <= 2, "one connection a lane: the port drops connections of a user that has too many"
@@ -90,10 +95,9 @@ async def test_a_waiting_hold_is_refused_by_a_later_safety_command(kind: str) ->
     mark = lanes.submit({"do": "mark", "text": "kept"})
     await asyncio.sleep(0.005)
     safe = lanes.submit({"do": kind})
-    said = [await each for each in (under_way, *waiting)]
+    said = await texts_of((under_way, *waiting))
     assert all("takes precedence; send again" in each for each in said), said
-    assert await mark == "mark: done"
-    assert await safe == f"{kind}: done"
+    assert await texts_of((mark, safe)) == ["mark: done", f"{kind}: done"]
     assert set(hold.sent) == {(kind, ""), ("mark", "kept")}
 
 
@@ -104,10 +108,10 @@ async def test_a_command_that_waits_too_long_is_refused_and_never_sent(monkeypat
     lanes = lanes_to(hold)
     said = [lanes.submit({"do": "hold"}) for _ in range(3)]
     begin_s = time.monotonic()
-    assert all("not obeyed within 0.1 s" in each for each in await asyncio.gather(*said))
+    assert all("not obeyed within 0.1 s" in each for each in await texts_of(said))
     assert time.monotonic() - begin_s < 0.5
     hold.open.set()
-    assert await lanes.submit({"do": "mark", "text": "now"}) == "mark: done"
+    assert (await lanes.submit({"do": "mark", "text": "now"})).done
     assert hold.sent == [("mark", "now")]
 
 
@@ -115,14 +119,14 @@ async def test_a_hold_that_hangs_delays_no_answer_and_gets_the_latch_as_soon_as_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(command_lanes, "SAFETY_ANSWER_S", 0.1)
-    hold, late = FakeHold(), list[str]()
+    hold, late = FakeHold(), list[Outcome]()
     hold.open.clear()
     lanes = lanes_to(hold, late)
     assert "no answer from the hold within 0.1 s" in await outcome_within(lanes.submit({"do": "latch"}), 0.5)
     assert "no answer from the hold within 0.1 s" in await outcome_within(lanes.submit({"do": "stop"}), 0.5)
     hold.open.set()
     await wait_for(lambda: len(late) == 2)
-    assert late == ["latch: done", "stop: done"]
+    assert [(outcome.command, outcome.done) for outcome in late] == [("latch", True), ("stop", True)]
 
 
 async def test_a_flood_of_latches_does_not_delay_a_stop() -> None:
@@ -130,7 +134,7 @@ async def test_a_flood_of_latches_does_not_delay_a_stop() -> None:
     lanes = lanes_to(hold)
     flood = [lanes.submit({"do": "latch", "text": str(number)}) for number in range(200)]
     assert await outcome_within(lanes.submit({"do": "stop"}), 0.5) == "stop: done"
-    said = await asyncio.gather(*flood)
+    said = await texts_of(flood)
     assert sum(each == "latch: done" for each in said) >= SAFETY_MOST_EACH
     assert all(each == "latch: done" or "wait already; send again" in each for each in said)
 
@@ -138,7 +142,7 @@ async def test_a_flood_of_latches_does_not_delay_a_stop() -> None:
 async def test_the_same_latch_of_many_is_sent_a_few_times_only() -> None:
     hold = FakeHold(takes_s=0.02)
     lanes = lanes_to(hold)
-    said = await asyncio.gather(*(lanes.submit({"do": "latch", "text": "hands"}) for _ in range(1000)))
+    said = await texts_of(lanes.submit({"do": "latch", "text": "hands"}) for _ in range(1000))
     assert all(each == "latch: done" or "is being sent" in each for each in said)
     assert len(hold.sent) <= 2
 
@@ -146,15 +150,15 @@ async def test_the_same_latch_of_many_is_sent_a_few_times_only() -> None:
 async def test_an_error_of_the_sender_is_an_answer_and_the_lanes_go_on() -> None:
     calls = 0
 
-    def send(request: dict[str, Any], limits: SendLimits) -> str:
+    def send(request: dict[str, Any], limits: SendLimits) -> Outcome:
         nonlocal calls
         calls += 1
         if calls <= 2:
             raise RuntimeError("bug")
-        return "done"
+        return Outcome.succeeded(str(request["do"]))
 
     lanes = CommandLanes(send, [].append)
-    assert await lanes.submit({"do": "mark"}) == "mark: not sent: RuntimeError: bug"
-    assert await lanes.submit({"do": "stop"}) == "stop: not sent: RuntimeError: bug"
-    assert await lanes.submit({"do": "mark"}) == "done"
-    assert await lanes.submit({"do": "stop"}) == "done"
+    for kind in ("mark", "stop"):
+        assert await lanes.submit({"do": kind}) == Outcome(kind, f"{kind}: not sent: RuntimeError: bug")
+    for kind in ("mark", "stop"):
+        assert await lanes.submit({"do": kind}) == Outcome.succeeded(kind)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.doors import command_lanes
 from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.telemetry import State
@@ -61,7 +62,7 @@ async def test_a_command_that_arrives_after_its_time_is_refused_by_the_hold(tmp_
         asked = {"do": "hold", "why": "door: mqtt"}
         late = SendLimits(time.monotonic() + 2.0, refusal)
         said = await asyncio.to_thread(send_command, where, "the-run", asked, late)
-        assert "hold refused: hold came 58" in said
+        assert "hold refused: hold came 58" in said.text
         assert run.asked == []
 
 
@@ -72,11 +73,13 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
             (limits(-0.1), "the hold answered too late"),
             (limits(2.0, "latch came meanwhile"), "hold refused: latch came meanwhile"),
         ):
-            assert says in await asyncio.to_thread(send_command, where, "the-run", {"do": "hold"}, given)
+            said = await asyncio.to_thread(send_command, where, "the-run", {"do": "hold"}, given)
+            assert says in said.text
+            assert not said.done
         said = await asyncio.to_thread(send_command, where, "another-run", {"do": "hold"}, limits(2.0))
-        assert "another run is listening now" in said
+        assert "another run is listening now" in said.text
         said = await asyncio.to_thread(send_command, where, "another-run", {"do": "stop"}, limits(-5.0, "no"))
-        assert said == "stop: done", "a safety command has no conditions"
+        assert said == Outcome.succeeded("stop"), "a safety command has no conditions"
         assert [command.kind for command in run.asked] == ["stop"]
 
 

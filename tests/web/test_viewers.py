@@ -133,13 +133,13 @@ def test_an_answer_that_no_session_takes_is_withdrawn(tmp_path: Path, monkeypatc
     slept: list[float] = []
     monkeypatch.setattr(panels.time, "sleep", slept.append)
     given = PageAnswer("calm", "anna")
-    assert (
-        panels.answered(tmp_path, "which?", given) == "calm: not taken: the session no longer asks; see its terminal"
-    )
+    not_taken = panels.answered(tmp_path, "which?", given)
+    assert not_taken.text == "calm: not taken: the session no longer asks; see its terminal"
+    assert not not_taken.done
     assert not (tmp_path / ANSWER).exists()
     log = LiveLog(tmp_path, 50.0, print)
     taken: list[PageAnswer | None] = []
     monkeypatch.setattr(panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",))))
-    assert panels.answered(tmp_path, "which?", given) == "calm: done"
+    assert panels.answered(tmp_path, "which?", given).done
     assert taken == [given]
-    assert panels.answered(tmp_path / "none", "which?", given).startswith("calm: not given: ")
+    assert panels.answered(tmp_path / "none", "which?", given).text.startswith("calm: not given: ")

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
@@ -38,10 +39,10 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             assert feed.seen.status["row"]["error_um"] == ROW.error_um
             assert feed.seen.role == "tune"
             said = await asyncio.to_thread(feed.ask, {"do": "pause", "why": "web: anna"})
-            assert said == "pause: done"
+            assert said == Outcome.succeeded("pause")
             assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: anna")]
             refused = await asyncio.to_thread(feed.ask, {"do": "setpoint", "value": 1e9})
-            assert refused.startswith("setpoint refused: setpoint 1e+09 um is outside the limits")
+            assert refused.text.startswith("setpoint refused: setpoint 1e+09 um is outside the limits")
             run.port.told(Mark("door <b>opened</b>", "anna"))
             await until(lambda: any("door" in line for line in feed.seen.events))
             assert [text for _, text in feed.marks] == ["door <b>opened</b>"]
@@ -59,13 +60,15 @@ async def test_a_command_for_the_last_run_does_not_reach_the_next(tmp_path: Path
     feed.seen = dataclasses.replace(feed.seen, name="an-earlier-run")
     async with port_run(tmp_path) as run:
         said = await asyncio.to_thread(feed.ask, {"do": "stop"})
-        assert "another run" in said
+        assert "another run" in said.text
         assert run.asked == []
 
 
 async def test_without_a_hold_the_answer_says_so(tmp_path: Path) -> None:
     feed = HoldFeed(Where(socket=tmp_path / "none.sock"))
-    assert "no hold is listening" in await asyncio.to_thread(feed.ask, {"do": "hold"})
+    outcome = await asyncio.to_thread(feed.ask, {"do": "hold"})
+    assert "no hold is listening" in outcome.text
+    assert not outcome.done
 
 
 def test_every_action_is_one_that_the_port_reads() -> None:
