@@ -90,7 +90,7 @@ def characterise_step(
     try:
         done = characterise.experiment(rig, limit_um, plan)
     except characterise.ExperimentError as error:
-        kind = PumpUnknownError if characterise.MAP_THE_PUMP in str(error) else errors.RejectedError
+        kind = PumpUnknownError if error.pump_suspected else errors.RejectedError
         raise kind(f"characterise: {error}") from None
     except ValueError as error:
         raise PumpUnknownError(f"characterise: {error}") from None

@@ -1,6 +1,5 @@
 """Measures one capture set on disk in full, for `measure` and every analysis of many sets."""
 
-import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,7 +103,7 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     deserves no trust.
     """
     if capture.lost:
-        flags = tuple(integrity.Flag(k, capture.unusable[k], math.inf) for k in capture.lost)
+        flags = tuple(integrity.flag_unreadable(k, capture.unusable[k]) for k in capture.lost)
         first = capture.lost[0]
         raise RejectedSetError(f"{capture.head.files[first]} is {capture.unusable[first]}", flags)
     return frame_stack.FrameStack(

@@ -112,8 +112,8 @@ def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> 
 
     Pictures that are the same, unreadable or dark need no prediction.
     """
-    by_prediction = ("moved", "differs", "stale or wrong", "flicker")
-    blamed = [f for f in flags if stack.patterns[f.frame].role == "sin" and f.reason.startswith(by_prediction)]
+    sinusoids = [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
+    blamed = [flag for flag in sinusoids if flag.defect in integrity.FOUND_BY_PREDICTION]
     if len(blamed) < _MANY_BLAMED:
         return ""
     return "; with this many frames blamed, check the geometry and the axes of these pictures"
@@ -146,9 +146,13 @@ def _put_back(
                 continue
             if not checked.flags and _believable_surface(checked):
                 pair = ((a, b), (b, a))
-                flags = (integrity.Flag(k, f"swapped with {stack.patterns[j].name}", math.inf, j) for k, j in pair)
-                found.append(replace(checked, flags=tuple(flags)))
+                flags = tuple(_flag_swapped(k, stack.patterns[j].name, j) for k, j in pair)
+                found.append(replace(checked, flags=flags))
     return found[0] if len(found) == 1 else None
+
+
+def _flag_swapped(frame: int, shown: str, swapped_with: int) -> integrity.Flag:
+    return integrity.Flag(frame, integrity.FrameDefect.SWAPPED, f"swapped with {shown}", math.inf, swapped_with)
 
 
 def _check(
@@ -162,7 +166,7 @@ def _check(
     geometry = Geometry.from_config(optics)
     grid = bins.BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-    known = {frame: integrity.Flag(frame, reason, math.inf) for frame, reason in stack.unusable.items()}
+    known = {frame: integrity.flag_unreadable(frame, reason) for frame, reason in stack.unusable.items()}
     known |= {flag.frame: flag for flag in integrity.obvious(stack, binned)}
     excluded = set(known)
     flags: list[integrity.Flag] = []

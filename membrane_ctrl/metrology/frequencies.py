@@ -14,7 +14,14 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import orders, phase
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack, bin_frames
-from membrane_ctrl.metrology.frames.integrity import Closure, Flag, closure, closure_with_phase
+from membrane_ctrl.metrology.frames.integrity import (
+    Closure,
+    Flag,
+    FrameDefect,
+    closure,
+    closure_with_phase,
+    flag_unreadable,
+)
 from membrane_ctrl.metrology.frames.series_integrity import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -61,7 +68,7 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     finest = [k for k, pattern in enumerate(stack.patterns) if not pattern.period_mm]
     count = len(finest)
     coarser = {k: reason for k, reason in stack.unusable.items() if k >= count}
-    flags |= {k: Flag(k, reason, np.inf) for k, reason in coarser.items()}
+    flags |= {k: flag_unreadable(k, reason) for k, reason in coarser.items()}
     mask = _fringes(stack, binned)
     while True:
         series = list(_all_series(stack, binned, optics, mask, flags))
@@ -116,7 +123,8 @@ def _all_series(
                 phase.step_weights(shifts)
             except ValueError:
                 said = f"{len(frames)} {axis} phase steps of {period_mm:g} mm are usable: too few for a phase"
-                raise RejectedSetError(said, tuple(Flag(n, "left out", np.inf) for n in left_out)) from None
+                named = tuple(Flag(n, FrameDefect.LEFT_OUT, "left out", np.inf) for n in left_out)
+                raise RejectedSetError(said, named) from None
             yield _Series(k, period_mm, frames, shifts, binned.means[frames][:, mask].astype(float))
 
 
@@ -147,7 +155,8 @@ def _bad_frame(stack: FrameStack, series: list[_Series], places: list[FloatArray
         blamed = one.blamed(places[one.axis])
         if blamed.suspect is not None and blamed.gain > GAIN:
             said = f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude is left"
-            found.append(Flag(one.frames[blamed.suspect], said, shares[k] / limit))
+            frame = one.frames[blamed.suspect]
+            found.append(Flag(frame, FrameDefect.INCONSISTENT, said, shares[k] / limit))
     return max(found, key=lambda flag: flag.severity, default=None)
 
 

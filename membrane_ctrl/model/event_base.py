@@ -53,7 +53,7 @@ class Event:
         It is synced to the disk at once: a power cut may follow.
     """
 
-    _kind: ClassVar[str] = ""
+    line_kind: ClassVar[str] = ""  # of the lines; `kind` of an instance is the same, unless it is unknown
     _template: ClassVar[str] = "{message}"
     _level: ClassVar[LogLevel] = LogLevel.INFO
     _subject: ClassVar[str] = ""
@@ -80,7 +80,7 @@ class Event:
         urgent: bool = False,
     ) -> None:
         dataclass(frozen=True)(cls)
-        cls._kind, cls._template, cls._level = kind, sentence, level
+        cls.line_kind, cls._template, cls._level = kind, sentence, level
         cls.opens, cls.closes, cls._subject = opens, closes, subject
         cls._severity, cls._delay_s = severity, delay_s
         cls._notable, cls.urgent = notable, urgent
@@ -91,7 +91,7 @@ class Event:
     @property
     def kind(self) -> str:
         """Kind as in the line."""
-        return self._kind
+        return self.line_kind
 
     @property
     def level(self) -> LogLevel:

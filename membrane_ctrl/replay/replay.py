@@ -34,7 +34,13 @@ class Decision:
     """A decision of the controller and its time: a state, a fault, or the shape loop's state."""
 
     time_s: float
-    what: str
+    kind: str  # of the event
+    name: str  # of the state or fault
+
+    @property
+    def what(self) -> str:
+        """The decision in words."""
+        return f"{self.kind} {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +145,8 @@ def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
     found: list[Decision] = []
     for time_s, event in told:
         match event:
-            case StateEntered(state=what) | Fault(name=what) | Cleared(name=what) | ShapeLoopState(state=what):
-                found.append(Decision(time_s, f"{event.kind} {what}"))
+            case StateEntered(state=name) | Fault(name=name) | Cleared(name=name) | ShapeLoopState(state=name):
+                found.append(Decision(time_s, event.kind, name))
     return found
 
 
@@ -197,9 +203,11 @@ def without_repeats(decisions: list[Decision]) -> list[Decision]:
     kept: list[Decision] = []
     shape = ""
     for decision in decisions:
-        if decision.what != shape:
+        is_shape = decision.kind == ShapeLoopState.line_kind
+        if not is_shape or decision.name != shape:
             kept.append(decision)
-        shape = decision.what if decision.what.startswith("shape") else shape
+        if is_shape:
+            shape = decision.name
     return kept
 
 

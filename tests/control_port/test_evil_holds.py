@@ -235,7 +235,7 @@ def test_a_fleet_lists_the_honest_hold_beside_any_peers(
         assert time.monotonic() - began_s < 15.0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(names)
-    assert lines[-1].split()[:3] == ["honest", "hold", "0.250"]
+    assert lines[-1].split()[:3] == ["honest", "hold", "0.25"]
     assert all("no contact" in line for line in lines[:-1])
 
 

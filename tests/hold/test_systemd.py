@@ -69,7 +69,10 @@ def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(systemd: s
         notify.told(from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"}))
         notify.heard(outputs(1.0, State.HOLD))
     messages = said(systemd)
-    assert messages[0][1:] == ["WATCHDOG=1", "STATUS=hold, fault 20, recording: /srv/?: less than 500 MB free"]
+    assert messages[0][1:] == [
+        "WATCHDOG=1",
+        "STATUS=hold, fault 20, recording: Disk almost full: /srv/?: less than 500 MB free",
+    ]
     assert messages[1] == ["WATCHDOG=1", "STATUS=hold"]
 
 

@@ -31,7 +31,7 @@ def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() ->
 
 @pytest.mark.parametrize("cls", KINDS.values())
 def test_every_kind_comes_back_from_its_line(cls: type[Event]) -> None:
-    event = from_dict({"kind": cls._kind})
+    event = from_dict({"kind": cls.line_kind})
     assert type(event) is cls
     again = from_dict(json.loads(json.dumps(event.to_dict())))
     assert repr(again) == repr(event)

@@ -154,7 +154,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
     said = [text.split()[1].rstrip(":") for _, text in strings(path, "/events", "TextLog:text")]  # after the time
     assert said == ["state", "fault", "Run"]
     found = summary_of(feed.spec.run_dir)
-    assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (1000, 5, 1, 0)
+    assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (1000, 5, 1, "done")
     assert found["dropped"] == {"inputs": 0, "events": 0, "shapes": 0}
     kinds = [json.loads(line)["kind"] for line in (feed.spec.run_dir / "events.jsonl").read_text().splitlines()]
     assert kinds == ["state", "fault", "end"]

@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.replay.replay import Decision, differing_fields, unmatched
 
-CHECK, HOLD, FAULT = Decision(1.0, "state check"), Decision(5.0, "state hold"), Decision(9.0, "fault late")
+CHECK, HOLD, FAULT = Decision(1.0, "state", "check"), Decision(5.0, "state", "hold"), Decision(9.0, "fault", "late")
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 1.0))
 
 

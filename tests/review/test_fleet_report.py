@@ -30,8 +30,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         written(folder / mirror, 0.02, seed=seed, name=name)
     event = {"kind": "alarm", "mono_s": 5.0, "time_utc": "2026-11-21T18:00:05+00:00", "alarm": "leaky"}
     event |= {"what": "raised", "severity": "warning", "text": "t", "to": "lab", "sent": True, "escalated": False}
+    fault = {"kind": "fault", "mono_s": 6.0, "time_utc": "2026-11-21T18:00:06+00:00", "code": 40, "name": "late"}
     with (folder / "north" / NAMES[0] / "events.jsonl").open("a") as log:
-        log.write(json.dumps(event) + "\n")
+        log.writelines(json.dumps(each) + "\n" for each in (event, fault))
     (folder / "south" / HOSTILE).mkdir()
     (folder / "south" / HOSTILE / "events.jsonl").write_text('{"kind": \n')
     (folder / "empty").mkdir()
@@ -91,6 +92,7 @@ def test_the_page_has_the_figures_of_each_runs_own_report(lab: Path, tmp_path: P
             assert found[name][key] == seconds[key]
         for key in ("verdict", "sentence", "settled_s", "ticks_missed"):
             assert found[name][key] == table[key]
+    assert [line.get("faults") for line in found.values()] == [["late"], [], None, None, None]
     assert [line.get("alarms") for line in found.values()] == [["leaky"], [], None, None, None]
     said = [line.get("problem", "") for line in found.values()]
     assert ["nothing to report" in said[2], "not a run" in said[3], "no such run" in said[4]] == [True, True, True]

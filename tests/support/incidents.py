@@ -26,11 +26,16 @@ class Incident:
     expected: list[Decision]
 
 
+def _read_decision(item: dict[str, object]) -> Decision:
+    kind, _, name = str(item["what"]).partition(" ")
+    return Decision(float(str(item["time_s"])), kind, name)
+
+
 def read_incident(folder: Path) -> Incident:
     """Read an incident. Raises InputError."""
     try:
         about = tomllib.loads((folder / "incident.toml").read_text(encoding="utf-8"))
-        expected = [Decision(float(item["time_s"]), str(item["what"])) for item in about["decisions"]]
+        expected = [_read_decision(item) for item in about["decisions"]]
         return Incident(folder, str(about["what"]), expected)
     except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
         raise errors.InputError(f"{folder}/incident.toml: {error}") from None

@@ -37,11 +37,24 @@ class FitQuality:
     # "ok"; "degraded": usable, the uncertainty is larger than it should be; "refused": no proposal
     verdict: Literal["ok", "degraded", "refused"]
     reasons: tuple[str, ...]  # the findings, each with a remedy
+    pump_suspected: bool = False  # by one of them: the pump may not match its configured curve
 
     @property
     def pump_unknown(self) -> bool:
-        """Refused because the pump is not what it is taken for."""
-        return self.verdict == "refused" and any(MAP_THE_PUMP in reason for reason in self.reasons)
+        """Refused because the pump does not match its configured curve."""
+        return self.verdict == "refused" and self.pump_suspected
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A problem of a record or its fit, with a remedy."""
+
+    text: str
+    pump_suspected: bool = False  # the remedy is to map the pump
+
+
+def _suspect_pump(problem: str) -> Finding:
+    return Finding(f"{problem}: {MAP_THE_PUMP}", pump_suspected=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,53 +79,50 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
     """Verdict on a record and its fit."""
     refused, degraded = _faults(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
-        degraded.append(
-            f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of the fit: "
-            "the bench changed in between; repeat the relay in steadier weather"
-        )
+        worse = f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of the fit"
+        degraded.append(Finding(f"{worse}: the bench changed in between; repeat the relay in steadier weather"))
     if validation is not None and validation.independence_p < _P_MIN:
-        degraded.append("new residuals still follow the flow: repeat with the doublets experiment")
+        degraded.append(Finding("new residuals still follow the flow: repeat with the doublets experiment"))
     verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
-    return FitQuality(verdict, (*refused, *degraded))
+    findings = (*refused, *degraded)
+    texts = tuple(finding.text for finding in findings)
+    return FitQuality(verdict, texts, any(finding.pump_suspected for finding in findings))
 
 
-def _faults(record: Record, identified: Identified) -> tuple[list[str], list[str]]:
+def _faults(record: Record, identified: Identified) -> tuple[list[Finding], list[Finding]]:
     """Findings that forbid a proposal, and those that only widen its error bars."""
     model, sigma = identified.model, identified.sigma
-    refused: list[str] = []
-    degraded: list[str] = []
+    refused: list[Finding] = []
+    degraded: list[Finding] = []
     if record.lost_fraction > _LOST_MAX:
-        refused.append(
-            f"{record.lost_fraction:.0%} of the readings were lost: check the laser (without one, the camera), repeat"
-        )
+        lost = f"{record.lost_fraction:.0%} of the readings were lost"
+        refused.append(Finding(f"{lost}: check the laser (without one, the camera), repeat"))
     if model.gain < _UNANSWERED * sigma.gain:
-        refused.append(
-            f"the mirror did not answer the pump (k = {model.gain:.2f} +- {sigma.gain:.2f}): {MAP_THE_PUMP}"
-        )
+        known = f"k = {model.gain:.2f} +- {sigma.gain:.2f}"
+        refused.append(_suspect_pump(f"the mirror did not answer the pump ({known})"))
         return refused, degraded
     if identified.largest_residual > _JUMP_SIGMAS:
         at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
-        refused.append(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay")
+        refused.append(Finding(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay"))
     if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
-        refused.append(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}")
+        refused.append(Finding(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}"))
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
-        degraded.append(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %")
+        degraded.append(Finding(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %"))
     if sigma.delay_s > max(_DELAY_SIGMA_MAX_S, _DELAY_SIGMA_SHARE * model.delay_s):
-        refused.append(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}")
+        refused.append(Finding(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}"))
     refused.extend(bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append(f"the residuals follow the flow (a saturating or sticking pump?): {MAP_THE_PUMP}")
+        degraded.append(_suspect_pump("the residuals follow the flow (a saturating or sticking pump?)"))
     if identified.whiteness_p < _P_MIN and model.gain > _STRONG:
-        refused.append(f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?): {MAP_THE_PUMP}")
+        coloured = f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?)"
+        refused.append(_suspect_pump(coloured))
     elif identified.whiteness_p < _P_MIN:
-        degraded.append(
-            "the residuals are coloured: something periodic moves the mirror or the reading, or the "
-            "weather is no random walk"
-        )
+        periodic = "something periodic moves the mirror or the reading, or the weather is no random walk"
+        degraded.append(Finding(f"the residuals are coloured: {periodic}"))
     return refused, degraded
 
 
-def bent(record: Record, identified: Identified) -> list[str]:
+def bent(record: Record, identified: Identified) -> list[Finding]:
     """The problem, if one gain does not describe both halves of the pump's range."""
     found = two_gains(record, identified)
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
@@ -120,7 +130,7 @@ def bent(record: Record, identified: Identified) -> list[str]:
         return []
     what = "the pump saturates" if found.above < found.below else "the pump stalls at small flows"
     gains = f"k = {found.below:.2f} below the holding flow and {found.above:.2f} above"
-    return [f"{what} ({gains}): {MAP_THE_PUMP}"]
+    return [_suspect_pump(f"{what} ({gains})")]
 
 
 _GAIN_SIGMA = 0.025  # k within 5 % at 2 sigma
@@ -190,7 +200,14 @@ class Characterised:
 
 
 class ExperimentError(Exception):
-    """No relay could be completed; the message is the last one's reason."""
+    """No relay could be completed; the message is the last one's reason.
+
+    `pump_suspected`: the pump may not match its configured curve.
+    """
+
+    def __init__(self, reason: str, pump_suspected: bool = False) -> None:
+        super().__init__(reason)
+        self.pump_suspected = pump_suspected
 
 
 def spec_of(
@@ -266,7 +283,8 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
         done = relay if done is None else done.followed_by(relay)
         if finished.reason.startswith(machine.NO_ANSWER) and not finished.completed:
-            raise ExperimentError(f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}")
+            otherwise = f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}"
+            raise ExperimentError(otherwise, pump_suspected=True)
         try:
             found = identify(done)
         except ValueError:  # too short to tell
@@ -275,7 +293,7 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
             done = None
             continue
         if not finished.completed and _too_strong(found):
-            raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}")
+            raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}", pump_suspected=True)
         around = replace(around, late_s=found.model.delay_s)
         if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or bent(done, found)):
             break

@@ -328,10 +328,15 @@ def _gains(row: Candidate) -> tuple[str, ...]:
 def _figures(row: Candidate) -> list[str]:
     if row.predicted is None:
         return ["unstable", "", "", ""]
-    found = {name: f"{getattr(row.figures, name):.{digits}f}" for name, digits in _DIGITS.items()}
-    if row.sigma is not None:
-        found = {name: f"{value} +- {getattr(row.sigma, name):.{_DIGITS[name]}f}" for name, value in found.items()}
-    return [value if not value.startswith("nan") else "not known" for value in found.values()]
+    return [_figure(row, name, digits) for name, digits in _DIGITS.items()]
+
+
+def _figure(row: Candidate, name: str, digits: int) -> str:
+    value = float(getattr(row.figures, name))
+    if math.isnan(value):
+        return "not known"
+    sigma = "" if row.sigma is None else f" +- {getattr(row.sigma, name):.{digits}f}"
+    return f"{value:.{digits}f}{sigma}"
 
 
 def _margins(row: Candidate) -> tuple[str, ...]:

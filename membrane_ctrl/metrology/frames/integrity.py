@@ -23,6 +23,7 @@ Both work for any N >= 4; from N = 5 on nothing else needs to be known.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 
@@ -162,14 +163,42 @@ _SCATTERS = 6.0  # of the good frames' scatter
 _DARK = 0.4  # less than this share of the light is no flicker
 
 
+class FrameDefect(Enum):
+    """What is wrong with a frame."""
+
+    UNREADABLE = auto()
+    LEFT_OUT = auto()  # without further reason
+    DARK = auto()
+    SATURATED = auto()
+    FLICKER = auto()
+    MOVED = auto()  # the film was elsewhere
+    STALE = auto()  # shows the picture of another frame
+    SWAPPED = auto()  # two frames show each other's pictures
+    WRONG_PICTURE = auto()  # stale, or another picture
+    DIFFERS = auto()  # from its prediction, without a name
+    INCONSISTENT = auto()  # with the other steps of its series
+
+
+# Found by comparing the frame with what the geometry predicts: a wrong geometry blames many frames so.
+FOUND_BY_PREDICTION = frozenset(
+    {FrameDefect.MOVED, FrameDefect.DIFFERS, FrameDefect.WRONG_PICTURE, FrameDefect.FLICKER}
+)
+
+
 @dataclass(frozen=True)
 class Flag:
     """A frame that does not belong."""
 
     frame: int
-    reason: str  # first word: stale, swapped, saturated, dark, flicker, moved, or what could not be read
+    defect: FrameDefect
+    reason: str  # for people
     severity: float  # times the limit
     swapped_with: int | None = None  # the frame that shows this one's pattern while this one shows its
+
+
+def flag_unreadable(frame: int, reason: str) -> Flag:
+    """Return the flag of a frame that could not be read."""
+    return Flag(frame, FrameDefect.UNREADABLE, reason, np.inf)
 
 
 def identical_frames(stack: FrameStack) -> dict[int, int]:
@@ -200,10 +229,11 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     flags = []
     for k in frames:
         if light[k] < _DARK * middle:
-            says = f"dark: {light[k] / middle:.2f} of the light of the others"
-            flags.append(Flag(k, says, middle / max(light[k], 1e-9)))
+            reason = f"dark: {light[k] / middle:.2f} of the light of the others"
+            flags.append(Flag(k, FrameDefect.DARK, reason, middle / max(light[k], 1e-9)))
         elif burnt[k] > usual + 10 * SATURATED_SHARE:
-            flags.append(Flag(k, f"saturated: {burnt[k]:.0%} of the bins", burnt[k] / SATURATED_SHARE))
+            reason = f"saturated: {burnt[k]:.0%} of the bins"
+            flags.append(Flag(k, FrameDefect.SATURATED, reason, burnt[k] / SATURATED_SHARE))
     return flags
 
 
@@ -252,22 +282,26 @@ def _judge_sinusoid(
         "saturated": (e.saturated - saturated) / SATURATED_SHARE,
     }
     kind = max(worst, key=lambda name: worst[name])
-    return [Flag(frame, _sinusoid_reason(kind, e, level, moved_um), worst[kind])] if worst[kind] > 1 else []
+    if worst[kind] <= 1:
+        return []
+    defect, reason = _sinusoid_defect(kind, e, level, moved_um)
+    return [Flag(frame, defect, reason, worst[kind])]
 
 
-def _sinusoid_reason(kind: str, e: Evidence, level: float, moved_um: float) -> str:
+def _sinusoid_defect(kind: str, e: Evidence, level: float, moved_um: float) -> tuple[FrameDefect, str]:
     light = e.level / max(level, 1e-9)
     if e.saturated > 10 * SATURATED_SHARE or kind == "saturated":
-        return f"saturated: {e.saturated:.0%} of the bins"
+        return FrameDefect.SATURATED, f"saturated: {e.saturated:.0%} of the bins"
     if light < _DARK:
-        return f"dark: {light:.2f} of the light of the others"
+        return FrameDefect.DARK, f"dark: {light:.2f} of the light of the others"
     if kind == "light" or abs(light - 1) > _FLICKER:
-        return f"flicker: {light:.3f} of the light of the others"
+        return FrameDefect.FLICKER, f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
-        return f"moved: the film was {e.moved_um - moved_um:+.0f} um from where the others saw it"
+        away_um = e.moved_um - moved_um
+        return FrameDefect.MOVED, f"moved: the film was {away_um:+.0f} um from where the others saw it"
     if kind == "step":
-        return f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
-    return f"differs from its prediction by {e.rest:.1%} of the light"
+        return FrameDefect.WRONG_PICTURE, f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
+    return FrameDefect.DIFFERS, f"differs from its prediction by {e.rest:.1%} of the light"
 
 
 def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
@@ -286,7 +320,8 @@ def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[
         light = abs(e.level / max(bright, 1e-9) - 1) / max(GRAY_SHARE, bright_limit / max(bright, 1e-9))
         content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0, 0.5 * bright / max(e.swing, 1e-9))
         if max(light, content) > 1:
-            flags.append(Flag(k, _gray_reason(e, bright, content > light), max(light, content)))
+            defect, reason = _gray_defect(e, bright, content > light)
+            flags.append(Flag(k, defect, reason, max(light, content)))
     for role in ("white", "black"):
         single = stack.single(role)
         if single is not None and single in evidence:
@@ -294,13 +329,15 @@ def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[
     return flags
 
 
-def _gray_reason(e: Evidence, bright: float, content: bool) -> str:
+def _gray_defect(e: Evidence, bright: float, content: bool) -> tuple[FrameDefect, str]:
     light = e.level / max(bright, 1e-9)
     if light < _DARK and e.swing < _DARK * bright:
-        return f"dark: {light:.2f} of the light of the others"
+        return FrameDefect.DARK, f"dark: {light:.2f} of the light of the others"
     if content:
-        return f"stale or wrong picture: differs from its prediction by {e.rest / bright:.0%} of the light"
-    return f"{'saturated' if e.saturated > 0.5 else 'flicker'}: {light:.3f} of the light of the others"
+        differs = f"differs from its prediction by {e.rest / bright:.0%} of the light"
+        return FrameDefect.WRONG_PICTURE, f"stale or wrong picture: {differs}"
+    defect = FrameDefect.SATURATED if e.saturated > 0.5 else FrameDefect.FLICKER
+    return defect, f"{defect.name.lower()}: {light:.3f} of the light of the others"
 
 
 def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Flag]:
@@ -310,9 +347,12 @@ def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Fla
     if max(rest, off) <= 1:
         return []
     if rest > off or not white:
-        return [Flag(frame, f"stale or wrong picture: differs from its prediction by {e.rest / bright:.0%}", rest)]
-    word = "dark" if light < _DARK else "saturated" if e.saturated > 0.5 else "flicker"
-    return [Flag(frame, f"{word}: {light:.3f} of the light of the others", off)]
+        differs = f"stale or wrong picture: differs from its prediction by {e.rest / bright:.0%}"
+        return [Flag(frame, FrameDefect.WRONG_PICTURE, differs, rest)]
+    defect = FrameDefect.SATURATED if e.saturated > 0.5 else FrameDefect.FLICKER
+    if light < _DARK:
+        defect = FrameDefect.DARK
+    return [Flag(frame, defect, f"{defect.name.lower()}: {light:.3f} of the light of the others", off)]
 
 
 def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]) -> Flag:
@@ -321,13 +361,14 @@ def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: 
     e = evidence[k]
     same = twins.get(k, next((late for late, early in twins.items() if early == k), None))
     if same is not None:
-        return Flag(k, f"stale: the same picture as {stack.patterns[same].name}", flag.severity)
+        twin = f"stale: the same picture as {stack.patterns[same].name}"
+        return Flag(k, FrameDefect.STALE, twin, flag.severity)
     if e.shows != k:
         name = stack.patterns[e.shows].name
         partner = evidence.get(e.shows)
         if partner is not None and partner.shows == k:
-            return Flag(k, f"swapped with {name}", flag.severity, e.shows)
-        return Flag(k, f"stale: shows {name}", flag.severity)
+            return Flag(k, FrameDefect.SWAPPED, f"swapped with {name}", flag.severity, e.shows)
+        return Flag(k, FrameDefect.STALE, f"stale: shows {name}", flag.severity)
     return flag
 
 

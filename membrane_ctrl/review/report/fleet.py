@@ -16,7 +16,7 @@ from membrane_ctrl.processes.child import results_of
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
 from membrane_ctrl.review.report.html import html_page, html_table, render, write_report
-from membrane_ctrl.review.report.json import pump_history, report_table
+from membrane_ctrl.review.report.json import pump_history, report_table, timeline
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.run_files.run import open_run
 
@@ -78,7 +78,7 @@ def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
         **{name: seconds.get(name) for name in ("mean_um", "std_um", "in_band")},
         "of": "true centre" if table["true"] else "reading",
         "state": states[-1] if states else "",
-        "faults": [line["name"] for line in table["timeline"] if line["kind"] == events.Fault.kind],
+        "faults": [each.event.name for each in timeline(analysis) if isinstance(each.event, events.Fault)],
         "alarms": sorted(alarms),
         "found": len(table["found"]),
         "anomalies": [anomaly["name"] for anomaly in table["anomalies"]],

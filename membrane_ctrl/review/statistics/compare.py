@@ -92,16 +92,20 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     late = [np.stack((part[0], np.log(np.maximum(part[1], 1e-6)))) for part in late]
     same = ours.level_s == theirs.level_s
     late_p = mean_p(late[0], late[1], window_s) if same else math.nan
-    late_note = f"tested by the maximum of each {window_s:g} s" if same else "no test: levels of different length"
+    late_note = f"tested by the maximum of each {window_s:g} s"
+    if not same:
+        late_note = "no test: levels of different length"
+    elif math.isnan(late_p):
+        late_note = _SHORT
     return [
         _tested("leak", "µm/s", ours.leak_um_per_s[0], theirs.leak_um_per_s[0],
                 mean_p(leak[0], leak[1], window_s), _STRETCHES),
         _tested("pump, mean", "of full", mine.pump.mean_fraction, other.pump.mean_fraction,
                 mean_p(pump[0], pump[1], window_s), _STRETCHES),
-        _tested("pump strokes", "1/h", mine.pump.travel_per_hour, other.pump.travel_per_hour, math.nan,
-                "no test: one sum over the run"),
-        _tested("lateness p99", "ms", mine.lateness_ms.quantile(0.99), other.lateness_ms.quantile(0.99),
-                late_p, late_note),
+        Difference("pump strokes", "1/h", mine.pump.travel_per_hour, other.pump.travel_per_hour, math.nan,
+                   "no test: one sum over the run"),
+        Difference("lateness p99", "ms", mine.lateness_ms.quantile(0.99), other.lateness_ms.quantile(0.99),
+                   late_p, late_note),
     ]  # fmt: skip
 
 
@@ -125,10 +129,8 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
 
 
 def _tested(name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = "") -> Difference:
-    """A row, which states if it has no test."""
-    if math.isnan(p_value) and not note.startswith("no test"):
-        note = _SHORT
-    return Difference(name, unit, ours, theirs, p_value, note)
+    """A row with a test; it states if that was not possible."""
+    return Difference(name, unit, ours, theirs, p_value, _SHORT if math.isnan(p_value) else note)
 
 
 def _held(analysis: Analysis, name: str) -> Column:

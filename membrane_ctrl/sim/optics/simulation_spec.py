@@ -57,11 +57,10 @@ class FrameFault:
         if not frame:
             raise ValueError(f"faults: {text!r} must read kind:frame or kind:frame:amount, as flicker:x_sin_2:0.8")
         try:
-            return cls(kind, frame, float(amount) if amount else None)  # type: ignore[arg-type]  # checked above
-        except ValueError as error:
-            if str(error).startswith("faults"):
-                raise
+            strength = float(amount) if amount else None
+        except ValueError:
             raise ValueError(f"faults: amount {amount!r} of {text!r} is not a number") from None
+        return cls(kind, frame, strength)  # type: ignore[arg-type]  # checked above
 
 
 @dataclass(frozen=True, slots=True)
