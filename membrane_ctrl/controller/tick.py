@@ -61,7 +61,6 @@ class TickOutputs:
 
 # First bytes of the inputs ring's messages.
 TICK, PIECE, MEMORY = b"T", b"P", b"M"
-MESSAGE_BYTES = 640  # a slot of the ring: a tick takes some 520; longer commands come in pieces
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
@@ -94,7 +93,8 @@ _LETTERS = {"<i8": "q", "<f8": "d", "|u1": "B", "<u4": "I"}
 _STRUCT = struct.Struct("<" + "".join(_LETTERS[RECORD[name].str] for name in RECORD.names or ()))
 assert _STRUCT.size == RECORD.itemsize
 _ROW_PLACE = len(TICK) + RECORD.itemsize
-assert _ROW_PLACE + telemetry.ROW_BYTES <= MESSAGE_BYTES
+# A slot of the ring has room for a tick. Commands and memories that are longer come in pieces.
+MESSAGE_BYTES = _ROW_PLACE + telemetry.ROW_BYTES
 # Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`

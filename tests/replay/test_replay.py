@@ -171,6 +171,7 @@ def test_a_long_command_comes_in_pieces_and_whole_again() -> None:
     messages = pack_tick(1, inputs, outputs, outputs.row.pack())
     assert len(messages) > 10
     assert max(len(message) for message in messages) <= MESSAGE_BYTES
+    assert len(messages[-1]) == MESSAGE_BYTES, "a slot is as large as a tick, whatever columns and sensors it has"
     assembler = TickAssembler()
     assert not len(assembler.take(messages[:4]).records)
     batch = assembler.take(messages[4:])
