@@ -13,15 +13,9 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import orders, phase
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
+from membrane_ctrl.metrology.frames import integrity
 from membrane_ctrl.metrology.frames.frame_stack import Binned, FrameStack, bin_frames
-from membrane_ctrl.metrology.frames.integrity import (
-    Closure,
-    Flag,
-    FrameDefect,
-    closure,
-    closure_with_phase,
-    flag_unreadable,
-)
+from membrane_ctrl.metrology.frames.integrity import Flag, FrameDefect
 from membrane_ctrl.metrology.frames.series_integrity import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -48,18 +42,22 @@ class _Series:
 
     def share(self) -> float:
         """What a sinusoid leaves of the frames, over its amplitude; NaN for three steps, which always agree."""
-        return self._over_amplitude(closure(self.seen, self.shifts_rad).rms_adu) if len(self.frames) > 3 else np.nan
+        return (
+            self._over_amplitude(integrity.closure(self.seen, self.shifts_rad).rms_adu)
+            if len(self.frames) > 3
+            else np.nan
+        )
 
     def _over_amplitude(self, rms_adu: float) -> float:
         return rms_adu / max(float(np.median(np.abs(self.phasor))), 1e-9)
 
-    def blamed(self, place_mm: FloatArray) -> Closure:
+    def blamed(self, place_mm: FloatArray) -> integrity.Closure:
         """The closure that can name a frame: of five steps, or with the phase by the other periods' place."""
         if len(self.frames) > 4:
-            return closure(self.seen, self.shifts_rad)
+            return integrity.closure(self.seen, self.shifts_rad)
         known = np.isfinite(place_mm)
         expected = 2 * np.pi * place_mm[known] / self.period_mm - np.pi
-        return closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
+        return integrity.closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
 
 
 def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
@@ -68,7 +66,7 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     finest = [k for k, pattern in enumerate(stack.patterns) if not pattern.period_mm]
     count = len(finest)
     coarser = {k: reason for k, reason in stack.unusable.items() if k >= count}
-    flags |= {k: flag_unreadable(k, reason) for k, reason in coarser.items()}
+    flags |= {k: integrity.flag_unreadable(k, reason) for k, reason in coarser.items()}
     mask = _fringes(stack, binned)
     while True:
         series = list(_all_series(stack, binned, optics, mask, flags))

@@ -46,15 +46,15 @@ class FitQuality:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FitFinding:
     """A problem of a record or its fit, with a remedy."""
 
     text: str
     pump_suspected: bool = False  # the remedy is to map the pump
 
 
-def _suspect_pump(problem: str) -> Finding:
-    return Finding(f"{problem}: {MAP_THE_PUMP}", pump_suspected=True)
+def _suspect_pump(problem: str) -> FitFinding:
+    return FitFinding(f"{problem}: {MAP_THE_PUMP}", pump_suspected=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,36 +80,36 @@ def judge(record: Record, identified: Identified, validation: Validation | None 
     refused, degraded = _faults(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
         worse = f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of the fit"
-        degraded.append(Finding(f"{worse}: the bench changed in between; repeat the relay in steadier weather"))
+        degraded.append(FitFinding(f"{worse}: the bench changed in between; repeat the relay in steadier weather"))
     if validation is not None and validation.independence_p < _P_MIN:
-        degraded.append(Finding("new residuals still follow the flow: repeat with the doublets experiment"))
+        degraded.append(FitFinding("new residuals still follow the flow: repeat with the doublets experiment"))
     verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
     findings = (*refused, *degraded)
     texts = tuple(finding.text for finding in findings)
     return FitQuality(verdict, texts, any(finding.pump_suspected for finding in findings))
 
 
-def _faults(record: Record, identified: Identified) -> tuple[list[Finding], list[Finding]]:
+def _faults(record: Record, identified: Identified) -> tuple[list[FitFinding], list[FitFinding]]:
     """Findings that forbid a proposal, and those that only widen its error bars."""
     model, sigma = identified.model, identified.sigma
-    refused: list[Finding] = []
-    degraded: list[Finding] = []
+    refused: list[FitFinding] = []
+    degraded: list[FitFinding] = []
     if record.lost_fraction > _LOST_MAX:
         lost = f"{record.lost_fraction:.0%} of the readings were lost"
-        refused.append(Finding(f"{lost}: check the laser (without one, the camera), repeat"))
+        refused.append(FitFinding(f"{lost}: check the laser (without one, the camera), repeat"))
     if model.gain < _UNANSWERED * sigma.gain:
         known = f"k = {model.gain:.2f} +- {sigma.gain:.2f}"
         refused.append(_suspect_pump(f"the mirror did not answer the pump ({known})"))
         return refused, degraded
     if identified.largest_residual > _JUMP_SIGMAS:
         at_s = float(np.argmax(np.abs(identified.residual_um))) * record.dt_s
-        refused.append(Finding(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay"))
+        refused.append(FitFinding(f"the mirror jumped at {at_s:.1f} s (a door?): repeat the relay"))
     if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
-        refused.append(Finding(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}"))
+        refused.append(FitFinding(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}"))
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
-        degraded.append(Finding(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %"))
+        degraded.append(FitFinding(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %"))
     if sigma.delay_s > max(_DELAY_SIGMA_MAX_S, _DELAY_SIGMA_SHARE * model.delay_s):
-        refused.append(Finding(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}"))
+        refused.append(FitFinding(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}"))
     refused.extend(bent(record, identified))
     if identified.independence_p < _P_MIN:
         degraded.append(_suspect_pump("the residuals follow the flow (a saturating or sticking pump?)"))
@@ -118,11 +118,11 @@ def _faults(record: Record, identified: Identified) -> tuple[list[Finding], list
         refused.append(_suspect_pump(coloured))
     elif identified.whiteness_p < _P_MIN:
         periodic = "something periodic moves the mirror or the reading, or the weather is no random walk"
-        degraded.append(Finding(f"the residuals are coloured: {periodic}"))
+        degraded.append(FitFinding(f"the residuals are coloured: {periodic}"))
     return refused, degraded
 
 
-def bent(record: Record, identified: Identified) -> list[Finding]:
+def bent(record: Record, identified: Identified) -> list[FitFinding]:
     """The problem, if one gain does not describe both halves of the pump's range."""
     found = two_gains(record, identified)
     least = max(_BENT_SIGMAS * found.difference_sigma, _BENT_SHARE * identified.model.gain)
