@@ -12,8 +12,8 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.steps import FoundEvent
+from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from membrane_ctrl.run_files.shapes import Shapes
-from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
 from tests.support.synthetic_shape import from_estimates
 
 HOURS = 8.0

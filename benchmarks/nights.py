@@ -23,7 +23,8 @@ from membrane_ctrl.controller.tick import RECORD, TICK, TickBatch
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows, ShapeState, State
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.run_files.tables import GIVEN, ColumnTables
+from membrane_ctrl.run_files.run_tables import RunTables
+from membrane_ctrl.run_files.table_specs import ROW_COLUMNS
 
 RATE_HZ = 10.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ))
@@ -36,6 +37,7 @@ WEATHER = {
 }
 LEAK_UM_PER_S = 1.24
 SHAPE_PERIOD_S = 4.0
+_SYNC_MINUTES = 10
 DOOR, LEAK, GLITCH, LOST, LATE, JUMP = (
     "pressure step", "leak step", "laser glitch", "laser lost", "lateness burst", "shape jump",
 )  # fmt: skip
@@ -132,13 +134,9 @@ def night(
 def batch_of(rows: Rows) -> TickBatch:
     """Ticks with these rows, and their inputs as far as the rows give them."""
     records = np.zeros(len(rows), dtype=RECORD)
-    for name, column in GIVEN.items():
-        if (field := column.removeprefix("given_")) in COLUMN:
-            records[name] = (
-                np.nan_to_num(rows[:, COLUMN[field]])
-                if records[name].dtype.kind in "iu"
-                else (rows[:, COLUMN[field]])
-            )
+    for name, column in ROW_COLUMNS.items():
+        values = rows[:, COLUMN[column]]
+        records[name] = np.nan_to_num(values) if records[name].dtype.kind in "iu" else values
     return TickBatch(records, rows, {}, {})
 
 
@@ -256,12 +254,15 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
     """A run folder as the recorder leaves it, without Rerun segments: batches of a minute, as they come in a run."""
     folder.mkdir(parents=True)
     (folder / "config.toml").write_text(config_file.dump(CONFIG), encoding="utf-8")
-    tables = ColumnTables(folder)
+    tables = RunTables(folder)
     end_s = 0.0
     minute = round(60 * RATE_HZ)
     for rows, shapes in parts:
         for first in range(0, len(rows), minute):
             tables.add_ticks(batch_of(rows[first : first + minute]))
+            if first // minute % _SYNC_MINUTES == 0:
+                tables.sync()
+                tables.seal()
         for estimate in shapes:
             tables.add_shape(estimate)
         end_s = float(rows[-1, COLUMN["mono_s"]])

@@ -22,7 +22,10 @@ from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.run_folder import create_run_folder
+from membrane_ctrl.run_files.table_store import writer as table_writer
+from membrane_ctrl.run_files.table_store.disk import Disk
 
 DAY_S = 86_400.0
 WRITE_S = 0.8  # the recorder's rounds: 0.75 s and a little
@@ -40,14 +43,31 @@ class HandClock(RunClock):
         return HandClock.moment_s
 
 
+class CountingDisk(Disk):
+    """Counts the bytes that tables write."""
+
+    written_bytes = 0
+
+    def write(self, descriptor: int, data: bytes) -> None:
+        """Write, and count."""
+        CountingDisk.written_bytes += len(data)
+        super().write(descriptor, data)
+
+
 @dataclass(frozen=True)
 class Recorded:
     """What a run took."""
 
-    mb_a_day: dict[str, float]  # by pattern of files
+    mb_a_day: dict[str, float]  # by table, and of Rerun segments
     rrd_before_mb: float  # a day, before they were optimised
     optimising_s: float
     busy: float  # share of a core
+    written_share: float  # bytes written for tables, to bytes kept
+
+    @property
+    def tables_mb(self) -> float:
+        """All tables but thumbnails, a day."""
+        return sum(self.mb_a_day[spec.name] for spec in table_specs.ALL if spec is not table_specs.THUMBNAILS)
 
 
 def run() -> list[Figure]:
@@ -55,11 +75,12 @@ def run() -> list[Figure]:
     found = recorded(Config(), DURATION_S)
     mb = found.mb_a_day
     return [
-        at_most("recording, optimised, without frames", mb["*.rrd"] + mb["columns/*"], "MB a day", 550.0),
-        at_most("of it Rerun segments", mb["*.rrd"], "MB a day", None, "before optimising", found.rrd_before_mb),
-        at_most("of it columns", mb["columns/*"], "MB a day"),
+        at_most("tables, without thumbnails", found.tables_mb, "MB a day", 300.0),
+        *(at_most(f"of it {name}", mb[name], "MB a day") for name in ("ticks", "inputs", "shapes")),
+        at_most("Rerun segments, optimised", mb["*.rrd"], "MB a day", None, "before optimising", found.rrd_before_mb),
+        at_most("bytes written for tables, to bytes kept", found.written_share, "", 3.0),
         at_most("optimising an hour at the lowest priority", found.optimising_s, "s"),
-        at_most("recorder, share of a core", 100 * found.busy, "%"),
+        at_most("recorder, share of a core", 100 * found.busy, "%", 3.0),
     ]
 
 
@@ -78,6 +99,8 @@ def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float)
     for end in (*readers.values(), *writers.values()):
         stack.callback(end.close)
     recording = Recording(run_dir, "day", clock, config)
+    CountingDisk.written_bytes = 0
+    table_writer.Disk = CountingDisk  # type: ignore[misc]
     recorder = Recorder(run_dir, clock, config, readers, recording, None, lambda report: None)
     busy_s = 0.0
     for number, part in enumerate(parts_of(config, duration_s, WRITE_S)):
@@ -93,8 +116,10 @@ def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float)
     before = _bytes(run_dir, "*.rrd")
     recorder.finish(in_haste=True)
     optimising_s = _optimised_s(run_dir)
-    mb = {pattern: _bytes(run_dir, pattern) * a_day for pattern in ("*.rrd", "columns/*", "columns/shapes*")}
-    return Recorded(mb, before * a_day, optimising_s, busy_s / duration_s)
+    mb = {spec.name: _bytes(run_dir, f"{spec.name}/*") * a_day for spec in table_specs.ALL}
+    mb["*.rrd"] = _bytes(run_dir, "*.rrd") * a_day
+    kept_bytes = sum(_bytes(run_dir, f"{spec.name}/*") for spec in table_specs.ALL)
+    return Recorded(mb, before * a_day, optimising_s, busy_s / duration_s, CountingDisk.written_bytes / kept_bytes)
 
 
 def _optimised_s(run_dir: Path) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from benchmarks.figures import Figure, at_most
 from benchmarks.recording import DAY_S, recorded
 from membrane_ctrl.config.schema import Config, ShapeConfig
+from membrane_ctrl.run_files import table_specs
 
 SHORT_S, LONG_S = 60.0, 300.0
 RATE_HZ = 20.0
@@ -24,9 +25,9 @@ def run() -> list[Figure]:
         for files in whole.mb_a_day
     }
     return [
-        at_most("20 tracked figures a second: their table", mb["columns/shapes*"], "MB a day", 150.0),
-        at_most("of it a figure", 1e6 * mb["columns/shapes*"] / DAY_S / RATE_HZ, "bytes"),
-        at_most("all columns", mb["columns/*"], "MB a day"),
+        at_most("20 tracked figures a second: their table", mb["tracked"], "MB a day", 150.0),
+        at_most("of it a figure", 1e6 * mb["tracked"] / DAY_S / RATE_HZ, "bytes"),
+        at_most("all tables", sum(mb[spec.name] for spec in table_specs.ALL), "MB a day", 300.0),
         at_most("Rerun segments of the first minutes, optimised", mb["*.rrd"], "MB a day"),
         at_most("recorder, share of a core", 100 * whole.busy, "%"),
     ]

@@ -20,7 +20,7 @@ _.power_cycle, _.set_double  # faults that scenarios and tests bring about
 _.__signature__  # Typer reads a command's options from it
 _.expect  # of a scenario: its tests
 _.__init_subclass__  # Python calls it
-_.priority, _.overdue_s, _.restarts, _.column_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
+_.priority, _.overdue_s, _.restarts, _.table_rows_lost, _.and_unrecorded, made_utc  # of events, written as a whole
 _.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregularity_rms_um  # numbers of a figure,
 _.pvr_um, _.rotational_pv_um, _.asymmetry_rms_um, _.slope_rms_urad  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
@@ -40,4 +40,3 @@ _.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _
 find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults.md, the safety case and the campaign
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
-TableReader, TableWriter, _.known_until_s, _.note_missing, _.check_all, _.newest, _.lost, _.parts, _.leave_folder

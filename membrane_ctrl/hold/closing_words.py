@@ -87,7 +87,7 @@ def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None
     else:
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
-    if any(run_dir.glob("*.rrd")):
+    if any(run_dir.glob("ticks/*")):
         newest = run_dir.parent == Path(RecordingConfig().logs_dir)  # where `review` looks for `last`
         print(f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}", file=sys.stderr)
 

@@ -334,7 +334,7 @@ class RecorderDone(Event, kind="recorder_done", sentence="Recorder done"):
     tables: Any
     errors: Any
     rows_lost: Any
-    column_rows_lost: Any
+    table_rows_lost: Any
     events_lost: Any
     input_ticks_lost: Any
     restarts: Any

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event as Flag
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,6 @@ from membrane_ctrl.model.run_events import Alive, Ended
 from membrane_ctrl.processes.child import STOP, parent_lives, reporter
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
-
-if TYPE_CHECKING:
-    from membrane_ctrl.recorder.sink import Recording
 
 # Rings are emptied this often; the ring of ticks must hold a few intervals.
 POLL_S = 0.25
@@ -90,7 +86,7 @@ def _record(
     first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)
     wanted = spec.frames is not None and spec.config.recording.thumbnails
-    thumbnails = Thumbnails(recording, spec.frames) if wanted and spec.frames is not None else None
+    thumbnails = Thumbnails(spec.frames) if wanted and spec.frames is not None else None
     recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes)
     next_write_s = 0.0
     while not recorder.ended:
@@ -121,6 +117,15 @@ def _end_event(clock: RunClock, exit_word: str) -> EventLine:
 # Small pictures of camera frames, now and then.
 
 
+@dataclass(frozen=True, slots=True)
+class Thumbnail:
+    """A small picture of a camera frame, as JPEG."""
+
+    time_s: float  # middle of the exposure
+    pattern: str
+    jpeg: bytes
+
+
 # Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.2 GB (no video:
 # docs/recording.md).
 THUMBNAIL_INTERVAL_S = 30.0
@@ -129,32 +134,36 @@ _JPEG_QUALITY = 80
 
 
 class Thumbnails:
-    """Sends the newest shared frame of each pattern, at most one set per `THUMBNAIL_INTERVAL_S`."""
+    """Makes pictures of the newest shared frame of each pattern, at most one set per `THUMBNAIL_INTERVAL_S`."""
 
-    def __init__(self, recording: "Recording", address: FrameAddress) -> None:
-        self._recording = recording
+    def __init__(self, address: FrameAddress) -> None:
         self._reader = FrameReader(address)
         self._step = max(1, address.height_px // THUMBNAIL_HEIGHT_PX)
         self._next_s = 0.0
         self._newest_index = -1
 
-    def send(self, now_s: float) -> None:
-        """Send a set if one is due and there are new frames."""
+    def take_due(self, now_s: float) -> list[Thumbnail]:
+        """A set if one is due and there are new frames, else none."""
         import rerun as rr
 
         if now_s < self._next_s:
-            return
+            return []
         newest: dict[str, FrameHead] = {head.pattern: head for head in self._reader.heads()}
         fresh = [head for head in newest.values() if head.index > self._newest_index]
         if not fresh:
-            return
+            return []
         self._next_s = now_s + THUMBNAIL_INTERVAL_S
         self._newest_index = max(head.index for head in fresh)
+        made = []
         for head in fresh:
             pixels = self._reader.copy(head, self._step)
             if pixels is not None:
                 picture = rr.Image(_eight_bit(pixels), color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
-                self._recording.log(f"/frames/{head.pattern}", head.time_s, picture)
+                assert isinstance(picture, rr.EncodedImage)
+                assert picture.blob is not None
+                jpeg = bytes(picture.blob.as_arrow_array()[0].as_py())
+                made.append(Thumbnail(head.time_s, head.pattern, jpeg))
+        return made
 
     def close(self) -> None:
         """Detach from the shared frames."""

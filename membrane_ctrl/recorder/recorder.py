@@ -15,7 +15,10 @@ from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
-from membrane_ctrl.run_files import run_folder, tables
+from membrane_ctrl.recorder.process import Thumbnail, Thumbnails
+from membrane_ctrl.run_files import levels, run_folder
+from membrane_ctrl.run_files.disk_budget import DetailLevel
+from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
 
 # A ring as the recorder reads it: each message once, even when a new recorder continues after a killed one.
@@ -67,7 +70,7 @@ class RecorderState:
     dropped: dict[str, int] = field(default_factory=dict)  # per ring: messages lost
     reference: shape_estimate.ShapeEstimate | None = None  # reference for changes of the figure
     state: float = math.nan  # of the controller, in the last row
-    windows: tables.OpenWindows = field(default_factory=tables.OpenWindows)
+    windows: levels.OpenWindows = field(default_factory=levels.OpenWindows)
     errors: int = 0
     rows_lost: int = 0
     events_lost: int = 0
@@ -132,7 +135,7 @@ class Recorder:
         config: Config,
         rings: dict[str, RingReader],
         recording: sink.Recording,
-        thumbnails: rerun_output.FrameSource | None,
+        thumbnails: Thumbnails | None,
         report: sink.Report,
         resumes: int = 0,
     ) -> None:
@@ -149,7 +152,7 @@ class Recorder:
         }
         self._errors = sink.RecorderErrors(report, before.errors)
         self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
-        self._rerun = rerun_output.RerunOutput(recording, config, thumbnails, self._errors, self._summary_page)
+        self._rerun = rerun_output.RerunOutput(recording, config, self._errors, self._summary_page)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
         self._events_file = sink.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
@@ -157,9 +160,11 @@ class Recorder:
         self._status = RunStatus()
         for told in run_folder.read_events(run_dir, []) if resumes else ():
             self._status = self._status.after_event(told.event, told.mono_s)
-        self._columns = tables.ColumnTables(run_dir, before.windows if resumes else None)
+        self._tables = RunTables(run_dir, clock.origin_utc, before.windows if resumes else None)
         self._input_ticks_lost = before.input_ticks_lost
         self._assembler = TickAssembler()
+        self._frames = thumbnails
+        self._thumbnails: list[Thumbnail] = []  # of this second
         self._resumes = resumes
         self._began_anew = resumes > 0 and handed_on is None
         self._messages: list[bytes] = []
@@ -185,6 +190,7 @@ class Recorder:
             self.urgent |= event.urgent
             self.ended |= isinstance(event, run_events.Ended)
         self._events += new
+        self._errors.guarded("table of events", lambda: self._tables.add_events(self._events_file.unwritten(new)))
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
 
     def _follow(self, event: Event, mono_s: float) -> None:
@@ -194,7 +200,7 @@ class Recorder:
         estimate = shape_estimate.unpack_estimate(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
-        self._errors.guarded("shape columns", lambda: self._columns.add_shape(estimate))
+        self._errors.guarded("table of shapes", lambda: self._tables.add_shape(estimate))
 
     def write(self) -> None:
         """Write everything since the last call to disk, and sync it."""
@@ -206,13 +212,23 @@ class Recorder:
         self.urgent = False
         guarded = self._errors.guarded
         guarded("summary", lambda: self._summary.add_rows(rows))
-        guarded("tick columns", lambda: self._columns.add_ticks(batch))
-        guarded("columns", self._columns.sync)
+        guarded("table of ticks", lambda: self._tables.add_ticks(batch))
+        guarded("table of thumbnails", lambda: self._take_thumbnails(now_s))
+        guarded("tables", self._tables.sync)
+        guarded("parts of tables", self._tables.seal)
         closed, self._rerun.closed = self._rerun.closed, []
         self._housekeeping.look(now_s, closed)
-        if not self._rerun.send(now_s, rows, new_events, shapes, self._housekeeping.detail):
+        if not self._rerun.send(now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail):
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
+
+    def _take_thumbnails(self, now_s: float) -> None:
+        self._thumbnails = []
+        if self._frames is None or self._housekeeping.detail != DetailLevel.ALL:
+            return
+        self._thumbnails = self._frames.take_due(now_s)
+        for each in self._thumbnails:
+            self._tables.add_thumbnail(each.time_s, each.pattern, each.jpeg)
 
     def _summary_page(self) -> str:
         return blueprint.summary_page(self._summary.as_dict(self._dropped(), {}), self._status, self._config)
@@ -226,7 +242,7 @@ class Recorder:
         # never cleared: the lost part stays lost
         what = f"{self._run_dir} was removed or moved; a new one starts at {now_s:.1f} s"
         self._errors.report_error("run folder", f"{what}, without the earlier data")
-        self._columns.leave_folder()
+        self._tables.leave_folder()
         self._rerun.leave_folder()
         self._events_file.begin_anew(self._events)
 
@@ -238,11 +254,11 @@ class Recorder:
             self._dropped(),
             self._rerun.shapes.reference,
             self._rerun.state,
-            self._columns.open_windows,
+            self._tables.open_windows,
             self._errors.errors,
             self._rows_lost,
             self._events_lost + self._events_file.lost,
-            self._input_ticks_lost + self._columns.lost_ticks,
+            self._input_ticks_lost + self._tables.lost_ticks,
             self._folder_anew_s,
         )
         save_state(self._run_dir, state)
@@ -256,15 +272,15 @@ class Recorder:
         self.write()
         guarded = self._errors.guarded
         guarded("recording", self._rerun.close)
-        guarded("columns", self._columns.close)
+        guarded("tables", self._tables.close)
         account = {
             "segments": self._rerun.segments,
-            "tables": self._columns.files,
+            "tables": self._tables.parts,
             "errors": self._errors.errors,
             "rows_lost": self._rows_lost,
-            "column_rows_lost": self._columns.lost,
+            "table_rows_lost": self._tables.lost,
             "events_lost": self._events_lost + self._events_file.lost,
-            "input_ticks_lost": self._input_ticks_lost + self._columns.lost_ticks,
+            "input_ticks_lost": self._input_ticks_lost + self._tables.lost_ticks,
             "restarts": self._resumes,
             "folder_anew_s": self._folder_anew_s,  # None: it is still the original
             # without its predecessor's state, the statistics start with the oldest message in the ring

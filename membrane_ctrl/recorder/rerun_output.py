@@ -1,42 +1,31 @@
 """Writes to Rerun every second, in segments; replaces the file of a dead writer."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+
+import rerun as rr
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.recorder import blueprint, rerun_streams, sink
+from membrane_ctrl.recorder.process import Thumbnail
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 
 # A full disk is retried this often, so that recording continues soon after a person makes room.
 RETRY_S = 10.0
 
 
-class FrameSource(Protocol):
-    """Sends thumbnails when they are due (`process.Thumbnails`)."""
-
-    def send(self, now_s: float) -> None:
-        """Send a set if one is due."""
-
-
 class RerunOutput:
     """Streams and segments; the recording has no segment yet. `summary` makes the page of figures so far."""
 
     def __init__(
-        self,
-        recording: sink.Recording,
-        config: Config,
-        thumbnails: FrameSource | None,
-        errors: sink.RecorderErrors,
-        summary: Callable[[], str],
+        self, recording: sink.Recording, config: Config, errors: sink.RecorderErrors, summary: Callable[[], str]
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
-        self._thumbnails = thumbnails
         self._errors = errors
         self._summary = summary
         self._next_summary_s = -math.inf
@@ -59,6 +48,7 @@ class RerunOutput:
         rows: telemetry.Rows,
         events: list[EventLine],
         shapes: list[shape_estimate.ShapeEstimate],
+        thumbnails: Sequence[Thumbnail],
         detail: DetailLevel,
     ) -> bool:
         """Send one second of data and sync it; False if Rerun lost it."""
@@ -72,7 +62,8 @@ class RerunOutput:
                 return False
             self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
             self._errors.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
-            self._errors.guarded("shape streams", lambda: self._send_shapes(now_s, shapes, detail))
+            self._errors.guarded("shape streams", lambda: self._send_shapes(shapes))
+            self._errors.guarded("thumbnails", lambda: self._send_thumbnails(thumbnails))
             self._errors.guarded("summary page", lambda: self._send_summary(now_s, events))
             try:
                 self._recording.flush()
@@ -93,11 +84,14 @@ class RerunOutput:
             self._alive = False
             raise
 
-    def _send_shapes(self, now_s: float, shapes: list[shape_estimate.ShapeEstimate], detail: DetailLevel) -> None:
+    def _send_shapes(self, shapes: list[shape_estimate.ShapeEstimate]) -> None:
         for estimate in shapes:
             self.shapes.send(estimate)
-        if self._thumbnails is not None and detail == DetailLevel.ALL:
-            self._thumbnails.send(now_s)
+
+    def _send_thumbnails(self, thumbnails: Sequence[Thumbnail]) -> None:
+        for each in thumbnails:
+            picture = rr.EncodedImage(contents=each.jpeg, media_type="image/jpeg")
+            self._recording.log(f"/frames/{each.pattern}", each.time_s, picture)
 
     def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
         if now_s < self._next_summary_s and not any(from_dict(event).notable for event in events):

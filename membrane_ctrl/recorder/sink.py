@@ -11,11 +11,12 @@ times out, and then `save`, `disconnect`, the stream's destructor and Rerun's ow
 stream is kept untouched, and the process must end without exit handlers.
 """
 
+import contextlib
 import os
 import traceback
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered, from_dict
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
-from membrane_ctrl.run_files import segments, shapes, streams
+from membrane_ctrl.run_files import shapes, streams
 
 APPLICATION = "membrane_ctrl"
 RUN_TIME = "run_time"
@@ -191,11 +192,22 @@ def is_whole(path: Path) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the reader warns if there is none
         try:
-            with segments.panics_are_faults():
+            with _panics_are_errors():
                 RrdReader(path).store()
         except (RuntimeError, ValueError, OSError):
             return False
     return True
+
+
+@contextlib.contextmanager
+def _panics_are_errors() -> Iterator[None]:
+    """Turn a panic in Rerun's code, which is not an `Exception` in Python, into a `RuntimeError`."""
+    try:
+        yield
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise RuntimeError(f"Rerun failed on it ({str(error)[:80]})") from None
 
 
 def _styled(archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object) -> rr.AsComponents:
@@ -276,6 +288,10 @@ class EventsFile:
         self._sync = False
         self._descriptor: int | None = None
         self.lost = 0
+
+    def unwritten(self, events: Sequence[EventLine]) -> list[EventLine]:
+        """The events that no earlier recorder of the run has written."""
+        return [event for event in events if dumps_checked(event).encode() + b"\n" not in self._written]
 
     def append(self, events: Sequence[EventLine]) -> None:
         """Write events, after those still waiting. Raises OSError (full disk)."""

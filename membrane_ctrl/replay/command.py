@@ -27,13 +27,11 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.replay import replay as replays
-from membrane_ctrl.run_files import inputs_file, run_folder, tables
+from membrane_ctrl.run_files import inputs_file, run_folder, table_specs
+from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
 
 # The parts of a run folder that a replay needs: configuration, inputs, recorded decisions, recorded rows.
-
-
-# A row is found in the recording by its time, which Rerun stores in whole nanoseconds.
-_SAME_TIME_S = 2e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,30 +47,24 @@ class RecordedRun:
 
     def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
         """Fields in which each row differs from the recorded one; None where the recording has none."""
-        from membrane_ctrl.replay.repair import read_rows
-        from membrane_ctrl.run_files.segments import FAULTS
+        return [self._differences(row) for row in rows]
 
-        found: list[dict[str, tuple[float, float]] | None] = [None] * len(rows)
-        for path in sorted(self.folder.glob("*.rrd")) if rows else ():
-            try:
-                recorded = read_rows(path)
-            except FAULTS:
-                continue
-            for n, row in enumerate(rows):
-                near = np.flatnonzero(np.abs(recorded[:, 0] - row.mono_s) < _SAME_TIME_S)
-                if near.size:
-                    then = telemetry.TelemetryRow(row.mono_s, *recorded[near[0]].tolist()[1:])
-                    found[n] = replays.differing_fields(row, then)
-        return found
+    def _differences(self, row: telemetry.TelemetryRow) -> dict[str, tuple[float, float]] | None:
+        after_s = math.nextafter(row.mono_s, math.inf)
+        recorded = next(open_run(self.folder).tick_blocks(telemetry.FIELDS, row.mono_s, after_s), None)
+        if recorded is None:
+            return None
+        then = telemetry.TelemetryRow(*(float(recorded[name][0]) for name in telemetry.FIELDS))
+        return replays.differing_fields(as_recorded(row), then)
 
 
-def open_run(folder: Path) -> RecordedRun:
+def open_recorded(folder: Path) -> RecordedRun:
     """Open a run. Raises InputError, naming the folder and what is missing."""
     if not (folder / "config.toml").is_file():
         raise InputError(f"{folder}: not a run folder (no config.toml)")
     inputs = inputs_file.InputsReader(folder)
-    if not inputs.paths:
-        raise InputError(f"{folder}: no recorded inputs (no table of ticks in columns/)")
+    if not inputs.exists:
+        raise InputError(f"{folder}: no recorded inputs (no table `inputs`)")
     log = run_folder.read_events(folder, [])
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
@@ -94,7 +86,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
-    run = open_run(folder)
+    run = open_recorded(folder)
     started_s = time.perf_counter()
     begin, found = _replayed(run, from_s, to_s)
     took_s = time.perf_counter() - started_s
@@ -119,7 +111,7 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
             )
         target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; describe the incident in its incident.toml", file=sys.stderr)
-    return int(Exit.DONE if report["verdict"] in {"identical", "same rows"} else Exit.REJECTED)
+    return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
 
 
 def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
@@ -133,8 +125,6 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replay
             )
         except UnknownMemoryError as error:
             print(f"from the run's start: {error}", file=sys.stderr)
-        finally:
-            run.inputs.program = inputs.program
     try:
         return 1, replays.replay(run.config, replays.recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
     except UnknownMemoryError as error:  # a memory after a gap
@@ -153,9 +143,8 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
     decisions = replays.unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
     first = found.different_rows[0] if found.different else None
     differences = run.differences(found.different_rows)
-    only_words = found.different == differences.count({})
     return {
-        "verdict": _verdict(found, only_words, bool(decisions), bool(run.inputs.damage)),
+        "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "begin_s": found.begin_s,
         "from_memory": begin > 1,
@@ -172,13 +161,13 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
     }
 
 
-def _verdict(found: replays.Replay, only_words: bool, decisions_differ: bool, damaged: bool) -> str:
+def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
     """The verdict: identical only if all was compared; decisions after a gap prove nothing about the code."""
-    if (found.different and not only_words) or (decisions_differ and not found.gaps):
+    if found.different or (decisions_differ and not found.gaps):
         return "different"
     if found.gaps or damaged or not found.compared:
         return "gaps"
-    return "same rows" if found.different else "identical"
+    return "identical"
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
@@ -193,10 +182,11 @@ def _lines(report: dict[str, Any]) -> list[str]:
             f"different  {report['different']} ticks, the first is tick {first['tick']} at {first['time_s']:.3f} s"
         )
         if report["fields"] is None:
-            lines.append("           the recorded values there are not in the *.rrd files")
+            lines.append("           the recorded values there cannot be read")
         elif not report["fields"]:
-            rows = "all their rows are" if report["verdict"] == "same rows" else "its row is"
-            lines.append(f"           {rows} the same: events or answers to commands differ")
+            lines.append(
+                "           its row is as recorded: a smaller difference, an event, or an answer to a command"
+            )
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]
@@ -234,11 +224,12 @@ def write_incident(
     if folder.exists():
         raise InputError(f"{folder}: already exists; choose another name")
     folder.mkdir()
-    kept = tables.ColumnTables(folder)
+    kept = RunTables(folder)
     for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
         kept.add_ticks(TickBatch(frame.records, _rows(frame.records), frame.tails, frame.memories))
         for estimate in frame.estimates.values():
             kept.add_shape(estimate)
+        kept.sync()
     kept.close()
     about = {
         "schema": SCHEMA,
@@ -260,9 +251,8 @@ def write_incident(
 def _rows(records: Records) -> telemetry.Rows:
     """Telemetry rows holding only the fields that repeat the ticks' inputs, NaN elsewhere."""
     rows = np.full((len(records), len(telemetry.FIELDS)), np.nan)
-    for name, column in tables.GIVEN.items():
-        if (field := column.removeprefix("given_")) in telemetry.COLUMN:
-            rows[:, telemetry.COLUMN[field]] = records[name]
+    for name, column in table_specs.ROW_COLUMNS.items():
+        rows[:, telemetry.COLUMN[column]] = records[name]
     return rows
 
 

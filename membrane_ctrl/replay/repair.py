@@ -2,9 +2,8 @@
 
 import json
 import os
-import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,49 +11,15 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.model import errors, files, plain_json, telemetry
-from membrane_ctrl.model.arrays import IntArray
-from membrane_ctrl.recorder import housekeeping
-from membrane_ctrl.run_files import column_reader, inputs_file, run, run_folder, streams, tables
-from membrane_ctrl.run_files.rrd_reader import REPAIRED
-from membrane_ctrl.run_files.segment_process import is_whole, read_parts
-from membrane_ctrl.run_files.segments import require_bounded
+from membrane_ctrl.run_files import inputs_file, run, run_folder, table_specs
 from membrane_ctrl.run_files.summary import Summary
+from membrane_ctrl.run_files.table_store.reader import TableReader
+from membrane_ctrl.run_files.table_store.spec import JOURNAL_SUFFIX
+from membrane_ctrl.run_files.table_store.writer import TableWriter
 
-# Rerun segments back to telemetry rows, for repairs and for replays that differ.
-
-
-_SCALARS = "Scalars:scalars"
-
-
-def read_rows(path: Path) -> telemetry.Rows:
-    """(n, len(FIELDS)) telemetry rows of a segment, by time in whole nanoseconds; fields not recorded are NaN.
-
-    Stops at damage. Raises RuntimeError, ValueError or OSError (Rerun uses all three) if nothing can be
-    read.
-    """
-    where = {stream.path: [telemetry.COLUMN[line.field] for line in stream.lines] for stream in streams.STREAMS}
-    found: dict[str, tuple[list[IntArray], list[telemetry.Rows]]] = {path: ([], []) for path in where}
-    for part in read_parts(path, set(where)):
-        if part.component == _SCALARS and part.values.shape[1] == len(where[part.entity]):
-            times, values = found[part.entity]
-            times.append(part.times_ns)
-            values.append(part.values)
-    every = [times for times, _ in found.values() if times]
-    if not every:
-        return np.empty((0, len(telemetry.FIELDS)))
-    axis_ns = np.unique(np.concatenate([np.concatenate(times) for times in every]))
-    rows = np.full((len(axis_ns), len(telemetry.FIELDS)), np.nan)
-    rows[:, telemetry.COLUMN["mono_s"]] = axis_ns * 1e-9
-    for entity, (times, values) in found.items():
-        if times:
-            places = np.searchsorted(axis_ns, np.concatenate(times))
-            rows[places[:, np.newaxis], where[entity]] = np.concatenate(values)
-    return rows
-
-
+REPAIRED = "repaired"  # below the run: the repaired files
 # A recorder writes every second: a run changed more recently is still in progress.
 _STILL_RUNNING_S = 5.0
-_SEGMENT_TIMEOUT_S = 3600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +57,9 @@ def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     if not (run_dir / "config.toml").is_file():
         raise errors.InputError(f"{run_dir}: not a run folder (no config.toml)")
     _refuse_running(run_dir)
-    segments = sorted(run_dir.glob("*.rrd"))
-    findings = [_repair_segment(path, in_place) for path in segments]
-    findings += _repair_events(run_dir, in_place)
+    findings = _repair_events(run_dir, in_place)
+    findings += _seal_journals(run_dir, in_place)
+    findings += _look_at_tables(run_dir)
     findings += _look_at_inputs(run_dir)
     findings += _look_at_config(run_dir)
     return [*findings, _repair_summary(run_dir, in_place)]
@@ -124,33 +89,6 @@ def _target(path: Path, in_place: bool) -> Path:
     if in_place:
         return path
     return files.make_folder(path.parent / REPAIRED) / path.name
-
-
-def _repair_segment(path: Path, in_place: bool) -> FileFinding:
-    try:
-        require_bounded(path)
-    except OSError as error:
-        return FileFinding(path.name, "torn", f"nothing could be recovered ({error.strerror})")
-    if is_whole(path):
-        return FileFinding(path.name, "whole", "")
-    with files.scratch_folder(path.parent, ".repair-") as folder:
-        part = folder / path.name
-        done = subprocess.run(
-            housekeeping.optimize_command(path, part, "--continue-on-error"),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env=housekeeping.quiet_environment(),
-            timeout=_SEGMENT_TIMEOUT_S,
-            check=False,
-        )
-        if not part.exists() or not is_whole(part):
-            why = done.stderr.decode(errors="replace").strip().splitlines()
-            return FileFinding(
-                path.name, "torn", f"nothing could be recovered ({why[-1] if why else 'no data in it'})"
-            )
-        target = _target(path, in_place)
-        files.move(part, target)
-    return FileFinding(path.name, "torn", f"recovered to {target.relative_to(path.parent)}")
 
 
 def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
@@ -186,14 +124,42 @@ def _is_whole_object(data: bytes) -> bool:
     return isinstance(table, dict) and plain_json.take_checksum(table)
 
 
+def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
+    """Make parts of the journals that a dead recorder left; only in place, as sealing removes the journal."""
+    findings = []
+    for spec in table_specs.ALL:
+        left = sorted((run_dir / spec.name).glob(f"*{JOURNAL_SUFFIX}"))
+        if left and in_place:
+            TableWriter(run_dir, spec, resumed=True).close()
+        action = (
+            "made parts of them" if in_place else "readable by `open_run`; --in-place makes parts for other programs"
+        )
+        if left:
+            findings.append(FileFinding(f"{spec.name} ({len(left)} journals)", "open", action))
+    return findings
+
+
+def _look_at_tables(run_dir: Path) -> list[FileFinding]:
+    """Report only: a reader skips what is damaged."""
+    findings = []
+    for spec in table_specs.ALL:
+        notes: list[str] = []
+        table = TableReader(run_dir, spec, notes)
+        table.note_missing()
+        table.check_all()
+        for _ in table.tables():
+            pass
+        findings += [FileFinding(spec.name, "damaged", note) for note in notes]
+    return findings
+
+
 def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
     """Report only: a replay reads whatever is intact."""
     reader = inputs_file.InputsReader(run_dir)
     ticks = sum(len(frame.records) for frame in reader)
-    name = f"inputs ({len(reader.paths)} files)"
     if reader.damage:
-        return [FileFinding(name, "torn", f"{ticks} ticks are readable; {'; '.join(reader.damage)}")]
-    return [FileFinding(name, "whole", f"{ticks} ticks")] if reader.paths else []
+        return [FileFinding("inputs", "torn", f"{ticks} ticks are readable")]
+    return [FileFinding("inputs", "whole", f"{ticks} ticks")] if reader.exists else []
 
 
 def _look_at_config(run_dir: Path) -> list[FileFinding]:
@@ -216,10 +182,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
 
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
-    """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`.
-
-    Without tables, the statistics lack the ticks that Rerun does not record (in quiet times).
-    """
+    """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`."""
     summary = Summary(run_folder.read_config(run_dir, []))
     path = run_dir / "events.jsonl"
     last_s = -np.inf
@@ -236,26 +199,14 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     good, _ = _split_events(files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)) if path.exists() else (b"", b"")
     for line in good.splitlines():
         summary.add_event(run_folder.event_of(line.decode()) or {})
-    table = summary.as_dict({}, {"segments": len(_segments(run_dir))})
+    table = summary.as_dict({}, {})
     table["ticks"] = max(table["ticks"], ticks)
     return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}
 
 
-def _segments(run_dir: Path) -> Sequence[Path]:
-    """Each segment once, in its repaired form if there is one."""
-    repaired = run_dir / REPAIRED
-    paths = sorted(run_dir.glob("*.rrd"))
-    return [repaired / path.name if (repaired / path.name).exists() else path for path in paths]
-
-
 def _all_rows(run_dir: Path) -> Iterator[telemetry.Rows]:
-    """Every tick of the tables; without tables, the rows of all readable segments."""
-    if column_reader.column_files(run_dir, tables.TICKS):
-        for block in run.open_run(run_dir).tick_blocks(telemetry.FIELDS):
-            yield np.column_stack([block[name] for name in telemetry.FIELDS])
+    """Every tick of the tables."""
+    if not run_folder.is_run(run_dir):
         return
-    for path in _segments(run_dir):
-        try:
-            yield read_rows(path)
-        except (RuntimeError, ValueError, OSError):  # Rerun raises any of these for an unreadable file
-            continue
+    for block in run.open_run(run_dir).tick_blocks(telemetry.FIELDS):
+        yield np.column_stack([block[name] for name in telemetry.FIELDS])

@@ -16,8 +16,9 @@ from membrane_ctrl.model import errors, events, files, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.clock import parse_duration_s
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
-from membrane_ctrl.run_files import column_reader, disk_budget, run_folder, tables
+from membrane_ctrl.run_files import disk_budget, run_folder, table_specs
 from membrane_ctrl.run_files.run import Run, origin_of
+from membrane_ctrl.run_files.table_store.reader import TableReader
 
 # A file of this name in a run's folder keeps it from being pruned.
 KEPT_FILE = ".keep"
@@ -204,12 +205,9 @@ def _fault_of_end(log: Sequence[run_folder.LoggedEvent], exit_: object) -> str:
 
 
 def _recorded_s(folder: Path) -> float:
-    """End of a run's 1 s level, from its last non-empty file."""
-    for path in reversed(column_reader.column_files(folder, tables.level_table(_LEVEL_S))):
-        table = column_reader.read_file(path, ["time_s"], [])
-        if table is not None and table.num_rows:
-            return float(table.column("time_s")[-1].as_py()) + _LEVEL_S
-    return math.nan
+    """End of a run's 1 s level."""
+    newest = TableReader(folder, table_specs.LEVELS[_LEVEL_S], []).newest("time_s")
+    return math.nan if newest is None else float(newest.as_py()) + _LEVEL_S
 
 
 def _number(value: object) -> float:

@@ -21,7 +21,7 @@ from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, end_s, moment_s, not_in, number, one_line, part_s, span
-from membrane_ctrl.run_files.column_file import FOLDER
+from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.run_folder import add_mark
 from membrane_ctrl.run_files.streams import STREAMS, named_table
@@ -33,15 +33,14 @@ def refuse_originals(folder: Path) -> None:
     A folder of exported files also has `events.jsonl`, and may be overwritten.
     """
     folder = folder.resolve()
-    at = folder.parent if folder.name == FOLDER else folder
-    if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob(f"{FOLDER}/*.arrows")):
+    at = folder.parent if any(folder.name == spec.name for spec in table_specs.ALL) else folder
+    if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob("ticks/ticks-*")):
         raise errors.InputError(f"{folder}: this folder contains the recorder's files; choose another folder")
 
 
 FORMATS = ("parquet", "csv", "hdf5")
 SHAPES = "shapes"
 EVENTS = "events"
-_CHECK_S = 60.0  # for a search for damage in the Rerun segments
 _SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
@@ -208,7 +207,6 @@ def show_command(run: Path, json: bool) -> int:
     """Print one run: its line of the catalogue, its states and faults, its missing parts."""
     opened = open_run(catalogue.resolve(run))
     opened.look_through()
-    opened.check_segments(_CHECK_S)
     entry = catalogue.entry(opened.folder)
     if json:
         table = catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from membrane_ctrl.controller.tick import RECORD, Records
+from membrane_ctrl.controller.tick import RECORD, SAME, Records
 from membrane_ctrl.model import shape_estimate
-from membrane_ctrl.run_files import column_reader, shapes, tables
+from membrane_ctrl.model.arrays import AnyArray
+from membrane_ctrl.run_files import run_tables, shapes, table_specs
+from membrane_ctrl.run_files.table_store.reader import TableReader
+from membrane_ctrl.run_files.table_store.spec import TableSpec
 
 T = TypeVar("T")
 # A shape is used within seconds of its exposures.
 _SHAPE_BEFORE_S = 60.0
+# Fields of a record that its telemetry row has as well, to the bit, and their columns there.
+_ROW_COLUMNS = {name: column for name, column in SAME.items() if name not in ("now_s", "tick")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,78 +36,123 @@ class InputsFrame:
 
 
 class InputsReader:
-    """Reads the inputs of a run or an incident from the tables `ticks`, `rare` and `shapes`, batch by batch.
+    """Reads the inputs of a run or an incident from its tables, a row group at a time.
 
-    Damage is listed, not raised.
+    Attributes
+    ----------
+    damage : list of str
+        Unreadable parts so far, one line per place.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._from_s = -math.inf
-        self.paths = column_reader.column_files(folder, tables.TICKS)
-        self.program = ""  # that wrote the last file read
-        self.damage: list[str] = []  # unreadable parts so far, one line per place
+        self.damage: list[str] = []
+
+    @property
+    def exists(self) -> bool:
+        """Whether the run has any recorded inputs."""
+        return self._reader(table_specs.INPUTS).exists
+
+    @property
+    def program(self) -> str:
+        """The program that wrote them; empty if unknown."""
+        return self._reader(table_specs.INPUTS).metadata().get("program", "")
 
     def __iter__(self) -> Iterator[InputsFrame]:
         """Yield all frames in order, each with the rare parts and shapes up to its end."""
         last = 0
         rare = _Ahead((row.time_s, row) for row in self._rare())
-        figures = _Ahead((estimate.time_s, estimate) for estimate in self._estimates())
-        for table in self._tables(tables.TICKS, tuple(tables.GIVEN.values())):
-            records = self._records(table)
-            records = records[(records["tick"] > last) & (records["now_s"] >= self._from_s)]
+        cycles = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.SHAPES))
+        tracked = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.TRACKED))
+        for block in self._records():
+            records = block[(block["tick"] > last) & (block["now_s"] >= self._from_s)]
             if not len(records):
                 continue
             last, until_s = int(records["tick"][-1]), float(records["now_s"][-1])
             parts = list(rare.until(until_s))
-            tails = {row.tick: row.data for row in parts if row.kind == tables.COMMANDS}
-            memories = {row.tick: row.data for row in parts if row.kind == tables.MEMORY}
-            yield InputsFrame(records, tails, memories, {found.time_s: found for found in figures.until(until_s)})
+            tails = {row.tick: row.data for row in parts if row.kind == run_tables.COMMANDS}
+            memories = {row.tick: row.data for row in parts if row.kind == run_tables.MEMORY}
+            estimates = [*cycles.until(until_s), *tracked.until(until_s)]
+            yield InputsFrame(records, tails, memories, {found.time_s: found for found in estimates})
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that starts at the last memory before this time of the run."""
+        """A reader that starts at the last memory before this time of the run, or at the run's start."""
         found = InputsReader(self._folder)
-        times_s = [row.time_s for row in found._rare() if row.kind == tables.MEMORY and row.time_s <= time_s]
-        found.damage.clear()  # reported again when the file is read
+        times_s = [row.time_s for row in found._rare() if row.kind == run_tables.MEMORY and row.time_s <= time_s]
+        found.damage.clear()  # reported again when the table is read
         found._from_s = max(times_s, default=-math.inf)
         return found
 
-    def _tables(self, table: str, names: Sequence[str], before_s: float = 0.0) -> Iterator[pa.Table]:
-        """A table's batches, without files that end before the reader starts."""
-        paths = column_reader.column_files(self._folder, table)
-        begin_s = self._from_s - before_s
-        time_name = "mono_s" if table == tables.TICKS else "time_s"
-        for place, path in enumerate(paths):
-            if math.isfinite(begin_s) and place + 1 < len(paths):
-                next_s = column_reader.first_s(paths[place + 1], time_name)
-                if next_s is not None and next_s < begin_s:
-                    continue
-            if table == tables.TICKS:
-                self.program = column_reader.written_by(path) or self.program
-            yield from column_reader.read_parts(path, names, self.damage, cells=0)
+    def _reader(self, spec: TableSpec) -> TableReader:
+        return TableReader(self._folder, spec, self.damage)
 
-    def _records(self, table: pa.Table) -> Records:
-        """The records of a batch; none if a field is missing."""
-        if not set(tables.GIVEN.values()) <= set(table.column_names):
-            return np.zeros(0, dtype=RECORD)
-        records = np.zeros(table.num_rows, dtype=RECORD)
-        for name, column in tables.GIVEN.items():
-            with np.errstate(invalid="ignore"):
-                records[name] = table.column(column).to_numpy()
-        return records
+    def _records(self) -> Iterator[Records]:
+        """Records of ticks, from the table of inputs and from their telemetry rows; of ticks that both have."""
+        rows = _TickRows(self._reader(table_specs.TICKS).tables(["tick", *_ROW_COLUMNS.values()], self._from_s))
+        names = table_specs.INPUTS.schema.names
+        for inputs in self._reader(table_specs.INPUTS).tables(names, self._from_s):
+            if inputs.column_names != names:
+                continue
+            numbers = _numbers(inputs, "tick")
+            same = rows.until(int(numbers.max()))
+            if same is None:
+                continue
+            _, here, there = np.intersect1d(numbers, _numbers(same, "tick"), return_indices=True)
+            records = np.zeros(here.size, dtype=RECORD)
+            records["tick"] = numbers[here]
+            for name in table_specs.INPUT_FIELDS:
+                records[name] = _numbers(inputs, "time_s" if name == "now_s" else name)[here]
+            for name, column in _ROW_COLUMNS.items():
+                records[name] = _numbers(same, column)[there]
+            yield records
 
     def _rare(self) -> Iterator[_Rare]:
-        for table in self._tables(tables.RARE, tables.rare_schema().names):
-            if table.column_names == tables.rare_schema().names:
-                rows = zip(*(table.column(name).to_pylist() for name in table.column_names), strict=True)
-                yield from (row for row in (_Rare(*values) for values in rows) if row.time_s >= self._from_s)
+        names = table_specs.RARE.schema.names
+        for table in self._reader(table_specs.RARE).tables(names, self._from_s):
+            if table.column_names == names:
+                rows = zip(*(table.column(name).to_pylist() for name in names), strict=True)
+                yield from (_Rare(*values) for values in rows if None not in values)
 
-    def _estimates(self) -> Iterator[shape_estimate.ShapeEstimate]:
-        for table in self._tables(tables.SHAPES, shapes.ESTIMATE_COLUMNS, _SHAPE_BEFORE_S):
+    def _estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
+        names = list(shapes.ESTIMATE_COLUMNS)
+        for table in self._reader(spec).tables(names, self._from_s - _SHAPE_BEFORE_S):
             try:
-                yield from shapes.estimates(table.filter(pc.field("time_s") >= self._from_s - _SHAPE_BEFORE_S))
+                yield from shapes.estimates(table.select(names))
             except (ValueError, LookupError) as error:
-                column_reader.add_note(self.damage, f"{tables.SHAPES}: a batch holds no estimates ({error})")
+                self.damage.append(f"{spec.name}: a row group holds no estimates ({error})")
+
+
+def _numbers(table: pa.Table, name: str) -> AnyArray:
+    """A column as it goes into a record: integers as such, missing readings as NaN."""
+    column = table.column(name).combine_chunks()
+    if pa.types.is_integer(column.type):
+        return np.asarray(column.fill_null(0).to_numpy(zero_copy_only=False))
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+class _TickRows:
+    """Telemetry rows in order of their ticks, handed out up to a given tick."""
+
+    def __init__(self, tables: Iterator[pa.Table]) -> None:
+        self._tables = tables
+        self._waiting: pa.Table | None = None
+
+    def until(self, tick: int) -> pa.Table | None:
+        """The rows up to a tick that were not handed out before; None without any."""
+        parts = [] if self._waiting is None else [self._waiting]
+        while not parts or int(_numbers(parts[-1], "tick")[-1]) < tick:
+            table = next(self._tables, None)
+            if table is None:
+                break
+            if table.num_rows and table.num_columns == 1 + len(_ROW_COLUMNS):
+                parts.append(table)
+        if not parts:
+            return None
+        joined = pa.concat_tables(parts)
+        count = int(np.searchsorted(_numbers(joined, "tick"), tick, side="right"))
+        self._waiting = joined.slice(count) if count < joined.num_rows else None
+        return joined.slice(0, count)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, files, plain_json, run_events
-from membrane_ctrl.run_files.column_file import FOLDER
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
 
@@ -186,15 +185,13 @@ def find_folder(path: Path) -> Path:
     if not folder.exists():
         raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists the runs")
     if not is_run(folder):
-        raise errors.InputError(f"{path}: not a run: it contains neither events.jsonl nor a recording")
+        raise errors.InputError(f"{path}: not a run: it contains neither events.jsonl nor a table of ticks")
     return folder.resolve()
 
 
 def is_run(folder: Path) -> bool:
     """Whether a folder contains anything of a run."""
-    return folder.is_dir() and (
-        (folder / "events.jsonl").exists() or any(folder.glob("*.rrd")) or any(folder.glob(f"{FOLDER}/*.arrows"))
-    )
+    return folder.is_dir() and ((folder / "events.jsonl").exists() or any(folder.glob("ticks/ticks-*")))
 
 
 @dataclass(frozen=True, slots=True)

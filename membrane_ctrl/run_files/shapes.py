@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -88,23 +90,36 @@ def height_basis(x: Column, y: Column) -> Column:
     return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
 
 
-# Columns read from the recorder's table.
-TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um", "covariance_um2")
+# Columns read from the recorder's tables.
+TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um")
 
 
-def from_table(table: pa.Table) -> Shapes:
-    """Shapes from the recorder's table, whatever columns it has."""
-    count = table.num_rows
-    kept, covariances = _covariances(table)
-    time_s = _numbers(table, "time_s")
-    coeffs = table.column("coeffs_um").combine_chunks() if "coeffs_um" in table.column_names else None
+def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) -> Shapes:
+    """Shapes from the recorder's tables of figures and of covariances, whatever columns they have; by time."""
+    parts = [_figures(table) for table in figures if {"time_s", "coeffs_um"} <= set(table.column_names)]
+    kept = [table for table in covariances if table.num_columns == 2]
+    names = (*NUMBERS, "coeffs_um", "verdict")
+    empty: dict[str, Any] = {name: np.empty((0, ZERNIKE_TERMS) if name == "coeffs_um" else 0) for name in names}
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in names} if parts else empty
+    order = np.argsort(joined["time_s"], kind="stable")
+    matrices = [_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
     return Shapes(
-        **{name: _numbers(table, name) for name in NUMBERS},
-        coeffs_um=np.full((count, ZERNIKE_TERMS), np.nan) if coeffs is None else _matrix(coeffs, count),
-        verdict=np.array(table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count),
-        covariance_time_s=time_s[kept],
-        covariance_um2=covariances,
+        **{name: values[order] for name, values in joined.items()},
+        covariance_time_s=np.concatenate([np.empty(0), *(_numbers(table, "time_s") for table in kept)]),
+        covariance_um2=np.concatenate([np.empty((0, ZERNIKE_TERMS**2)), *matrices]).reshape(
+            -1, ZERNIKE_TERMS, ZERNIKE_TERMS
+        ),
     )
+
+
+def _figures(table: pa.Table) -> dict[str, AnyArray]:
+    count = table.num_rows
+    verdicts = table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count
+    figures: dict[str, AnyArray] = {name: _numbers(table, name) for name in NUMBERS}
+    return figures | {
+        "coeffs_um": _matrix(table.column("coeffs_um"), ZERNIKE_TERMS),
+        "verdict": np.array([verdict or "" for verdict in verdicts]),
+    }
 
 
 # All columns of an estimate.
@@ -124,35 +139,12 @@ def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
     """The estimates in the recorder's table, as given to the controller. Raises ValueError if they are invalid."""
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
-    coeffs = _matrix(table.column("coeffs_um").combine_chunks(), table.num_rows)
-    uppers = table.column("upper_um2").combine_chunks().flatten().to_numpy().reshape(table.num_rows, -1)
+    coeffs = _matrix(table.column("coeffs_um"), ZERNIKE_TERMS)
+    uppers = _matrix(table.column("upper_um2"), table.schema.field("upper_um2").type.list_size).astype(np.float32)
     for head, row, upper in zip(heads, coeffs, uppers, strict=True):
         named = dict(zip(names, head, strict=True))
+        named |= {name: math.nan for name in shape_estimate.NUMBERS if named[name] is None}
         yield shape_estimate.unpack_estimate(shape_estimate.packed_parts(named, row, upper))
-
-
-def from_columns(columns: Mapping[str, Column]) -> Shapes:
-    """Shapes from a Rerun segment (`rrd_reader.read_shapes`), which lacks the Hencky part and the covariance."""
-    count = columns["time_s"].size if columns else 0
-    numbers = {name: columns.get(name, np.full(count, np.nan)) for name in NUMBERS}
-    return Shapes(
-        **{**numbers, "hencky_um": np.zeros(count)},
-        coeffs_um=columns.get("coeffs_um", np.empty((0, ZERNIKE_TERMS))),
-        verdict=np.array(["ok"] * count),
-        covariance_time_s=np.empty(0),
-        covariance_um2=np.empty((0, ZERNIKE_TERMS, ZERNIKE_TERMS)),
-    )
-
-
-def joined(parts: list[Shapes]) -> Shapes:
-    """Concatenate shapes, each cycle once."""
-    if not parts:
-        return from_columns({})
-    names = (*NUMBERS, "coeffs_um", "verdict", "covariance_time_s", "covariance_um2")
-    whole = Shapes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-    # a journal may repeat rows that the recorder wrote just before it was killed
-    until_s = np.maximum.accumulate(np.concatenate(([-np.inf], whole.time_s)))[:-1]
-    return whole.select(whole.time_s > until_s)
 
 
 def _numbers(table: pa.Table, name: str) -> Column:
@@ -161,19 +153,10 @@ def _numbers(table: pa.Table, name: str) -> Column:
     return np.asarray(table.column(name).to_numpy(), dtype=np.float64)
 
 
-def _matrix(cells: pa.Array, count: int) -> Column:
-    return np.asarray(cells.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(count, ZERNIKE_TERMS)
-
-
-def _covariances(table: pa.Table) -> tuple[NDArray[np.int64], Column]:
-    """Rows with a covariance, and the (k, terms, terms) matrices."""
-    if "covariance_um2" not in table.column_names:
-        return np.empty(0, dtype=np.int64), np.empty((0, ZERNIKE_TERMS, ZERNIKE_TERMS))
-    cells = table.column("covariance_um2").combine_chunks()
-    lengths = np.diff(np.asarray(cells.offsets))
-    values = np.asarray(cells.flatten(), dtype=np.float64)
-    whole = lengths == ZERNIKE_TERMS**2
-    return np.flatnonzero(whole), values[np.repeat(whole, lengths)].reshape(-1, ZERNIKE_TERMS, ZERNIKE_TERMS)
+def _matrix(cells: pa.ChunkedArray, width: int) -> Column:
+    """A column of fixed-size lists as (n, width) numbers; a missing list is a row of NaN."""
+    rows = cells.combine_chunks().fill_null([math.nan] * width) if cells.null_count else cells.combine_chunks()
+    return np.asarray(rows.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(-1, width)
 
 
 BARS_PATH = "/shape/change_bars"

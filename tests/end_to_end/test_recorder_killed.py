@@ -49,7 +49,7 @@ def test_a_killed_recorder_is_replaced_and_every_tick_replayed(
     ) as hold:
         try:
             until_s = time.monotonic() + PATIENCE_S
-            while not list(tmp_path.glob("*-kill/columns/ticks-waiting.arrows")):
+            while not list(tmp_path.glob("*-kill/ticks/ticks-0000.journal")):
                 assert time.monotonic() < until_s, "no recording has begun"
                 time.sleep(0.05)
             (run_dir,) = tmp_path.glob("*-kill")

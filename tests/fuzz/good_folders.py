@@ -43,7 +43,7 @@ def good_run(logs: Path) -> Path:
     (folder / "events.jsonl").write_text("".join(f"{dumps_checked(line)}\n" for line in stamped))
     for event in stamped:
         summary.add_event(event)
-    files = [path.name.rpartition("-")[0] for path in (folder / "columns").iterdir()]
+    files = [path.parent.name for path in folder.glob("*/*.parquet")]
     counts = {"segments": 1, "tables": {table: files.count(table) for table in files}}
     (folder / "summary.json").write_text(dumps_checked(summary.as_dict({}, counts), indent=2))
     mark = {"mono_s": 1.0, "kind": "mark", "text": "door", "who": "me", "time_utc": "2026-11-21T01:02:04+00:00"}

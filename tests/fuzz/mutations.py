@@ -15,9 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import tomli_w
 
 from membrane_ctrl.model.plain_json import KEY, dumps_checked, with_comment
+from membrane_ctrl.run_files.table_store.journal import MAGIC
 
 CANARY = "canary.txt"  # beside the folder: what nobody may read, change or remove
 _TEXT = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\b\u202emirror\u2066[bold]\U000e0041"
@@ -40,7 +43,7 @@ _OTHERS = (
     "/dev/zero",
 )
 _TIMES = ("2026-11-21", "9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00-12:00", "2026-11-21T01:02:03", "now")
-_SEAL = re.compile(rb"seal:([0-9a-f]{4})([0-9a-f]{8})([0-9a-f]{8})")
+_HEAD_BYTES = 32  # of a journal's frame
 
 Mutation = Callable[[Path, random.Random], None]
 
@@ -151,7 +154,7 @@ def swap(path: Path, rng: random.Random) -> None:
         path.write_bytes(theirs)
         other.write_bytes(ours)
         return
-    name = rng.choice((f"ticks-{rng.randrange(999):03d}.arrows", "x\x1b[31m.rrd", "night-007.rrd"))
+    name = rng.choice((f"ticks-{rng.randrange(9999):04d}.parquet", "x\x1b[31m.rrd", "night-007.rrd"))
     shutil.copy(path, path.parent / name)
 
 
@@ -160,7 +163,7 @@ def planted(path: Path, rng: random.Random) -> None:
     outside = next(parent / CANARY for parent in path.parents if (parent / CANARY).exists())
     names = (
         ".probe", ".night-000.rrd.part", ".summary.json.part", "summary.json", "repaired", "report", "export",
-        "report/report.html", "result/result.json", ".recorder-state", "annotations.jsonl", "stability", "columns",
+        "report/report.html", "result/result.json", ".recorder-state", "annotations.jsonl", "stability", "ticks",
         "result/.result.json.part", "export/ticks.csv", "repaired/night-000.rrd", "events.jsonl.torn", "result",
         "geometry.toml",
     )  # fmt: skip
@@ -235,23 +238,40 @@ def _change(value: Any, rng: random.Random) -> None:
 
 
 def resealed(path: Path, rng: random.Random) -> None:
-    """Bytes of a sealed stream are others, and the seals are right again: what a forger would write."""
+    """Bytes of a journal are others, and its checksums are right again: what a forger would write."""
     rng.choice((flip, numbers))(path, rng)
     path.write_bytes(sealed_again(path.read_bytes()))
 
 
 def sealed_again(content: bytes) -> bytes:
-    """A stream whose messages were changed, with seals that fit."""
+    """A journal whose frames were changed, with checksums that fit."""
     data = bytearray(content)
-    for found in list(_SEAL.finditer(content)):
-        offset, length = int(found[1], 16), int(found[2], 16)
-        start = found.start() - offset
-        if start < 0 or start + length > len(data):
-            continue
-        data[found.start(3) : found.end(3)] = 8 * b"0"
-        crc = zlib.crc32(data[start : start + length])
-        data[found.start(3) : found.end(3)] = b"%08x" % crc
+    for start in [found.start() for found in re.finditer(re.escape(MAGIC), content)]:
+        if start + _HEAD_BYTES > len(data):
+            break
+        (packed_bytes,) = struct.unpack_from("<I", data, start + 20)
+        crc = zlib.crc32(
+            data[start + _HEAD_BYTES : start + _HEAD_BYTES + packed_bytes], zlib.crc32(data[start : start + 28])
+        )
+        struct.pack_into("<I", data, start + 28, crc)
     return bytes(data)
+
+
+def unlisted(path: Path, rng: random.Random) -> None:
+    """Bytes of a part are others, and there is no manifest that says so."""
+    (path.parent / "manifest.jsonl").unlink(missing_ok=True)
+    rng.choice((flip, numbers))(path, rng)
+
+
+def rewritten(path: Path, rng: random.Random) -> None:
+    """A part is written again, with other rows in a column, and no manifest."""
+    (path.parent / "manifest.jsonl").unlink(missing_ok=True)
+    table = pq.read_table(path)
+    place = rng.randrange(table.num_columns)
+    field = table.schema.field(place)
+    other = rng.choice((pa.nulls(table.num_rows, field.type), pa.array([_TEXT] * table.num_rows)))
+    table = rng.choice((table.set_column(place, field.name, other), table.append_column(field.name, other)))
+    pq.write_table(table, path, compression=rng.choice(("zstd", "snappy", "none")), data_page_version="2.0")
 
 
 def picture(path: Path, rng: random.Random) -> None:
@@ -271,7 +291,8 @@ _OF: dict[str, tuple[Mutation, ...]] = {
     ".json": (table,) * 6,
     ".jsonl": (table,) * 6,
     ".toml": (toml,) * 6,
-    ".arrows": (resealed,) * 6,
+    ".journal": (resealed,) * 6,
+    ".parquet": (unlisted, unlisted, unlisted, rewritten),
     ".png": (picture,) * 3,
     ".rrd": (numbers, flip),
 }

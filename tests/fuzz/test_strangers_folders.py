@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
-import re
 import shutil
 import struct
 import tomllib
@@ -18,19 +16,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import tomli_w
 from fuzz_folders import Case, Room, case
 from good_folders import RUN, good_run, good_sets
-from mutations import sealed_again
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.run_files import run_folder
-from membrane_ctrl.run_files.column_file import PROGRAM
-from membrane_ctrl.run_files.sealed_stream import SealedStream, require_bounded, unseal
-from membrane_ctrl.run_files.segments import panics_are_faults, whole_messages
-from membrane_ctrl.run_files.tables import tick_schema
+from membrane_ctrl.run_files.table_specs import TICKS
 from tests.support.peak_memory import peak_mb, reset_peak
 
 HOSTILE = "\x1b]0;owned\x07\x9b2J\r\u202e[/red]"
@@ -86,8 +81,8 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (("repair",), (".probe", ".summary.json.part", "repaired/night-000.rrd", "repaired/.night-000.rrd.part")),
-        (("repair", "--in-place"), (".night-000.rrd.part", "events.jsonl.torn")),
+        (("repair",), (".probe", ".summary.json.part", "repaired/events.jsonl", "repaired/.events.jsonl.part")),
+        (("repair", "--in-place"), (".events.jsonl.part", "events.jsonl.torn")),
         (("report",), ("report/report.html", "report/.report.json.part")),
         (("export", "--format", "csv"), ("export/ticks.csv", "export/events.jsonl")),
     ],
@@ -98,8 +93,6 @@ def test_a_planted_link_takes_no_file_of_the_user(
     (folder / "summary.json").unlink()
     with (folder / "events.jsonl").open("a") as log:
         log.write('{"kind": "half')
-    with (folder / "night-000.rrd").open("r+b") as file:
-        file.truncate(file.seek(0, os.SEEK_END) - 40)
     for name in names:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).symlink_to(secret)
@@ -122,8 +115,8 @@ def test_a_linked_folder_is_refused_in_one_line(
 ) -> None:
     aim = secret.parent / "mine"
     aim.mkdir()
-    with (folder / "night-000.rrd").open("r+b") as file:
-        file.truncate(file.seek(0, os.SEEK_END) - 40)
+    with (folder / "events.jsonl").open("a") as log:
+        log.write('{"kind": "half')
     if name.endswith(".jsonl"):
         (folder / name).unlink()
         (folder / name).symlink_to(secret)
@@ -147,7 +140,7 @@ def test_a_folder_that_the_user_names_may_be_a_link(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("what", ["link", "pipe", "folder", "device"])
 @pytest.mark.parametrize(
-    "name", ["config.toml", "events.jsonl", "summary.json", "columns/ticks-000.arrows", "night-000.rrd"]
+    "name", ["config.toml", "events.jsonl", "summary.json", "ticks/ticks-0000.parquet", "ticks/manifest.jsonl"]
 )
 def test_what_is_no_plain_file_is_noted_and_not_waited_for(
     folder: Path, secret: Path, name: str, what: str, capsys: Said
@@ -170,121 +163,44 @@ def test_what_is_no_plain_file_is_noted_and_not_waited_for(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_four_megabytes_of_a_table_that_would_be_four_gigabytes(folder: Path, capsys: Said) -> None:
-    path = folder / "columns" / "ticks-000.arrows"
-    schema = tick_schema()
-    stream = SealedStream(path, schema, "zstd")
-    zeros = np.zeros(1_000_000)
-    arrays = [pa.array(zeros, field.type) for field in schema]
-    stream.write(pa.record_batch(arrays, schema=schema))
-    stream.close()
+def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Said) -> None:
+    path = folder / "ticks" / "ticks-0000.parquet"
+    zeros = pa.array(np.zeros(20_000_000, np.int8))
+    table = pa.table([zeros.cast(field.type) for field in TICKS.schema][:8], names=TICKS.schema.names[:8])
+    pq.write_table(table, path, compression="zstd", row_group_size=len(zeros))
+    (path.parent / "manifest.jsonl").unlink()
     assert path.stat().st_size < 1e6
+    del table, zeros
     before_mb = reset_peak()
     assert run(["report", str(folder), "--json"]) == 0
-    assert re.search(r"ticks-000.arrows: cannot be read \(a batch of \d+ MB", capsys.readouterr().out)
+    assert "more rows than a recorder writes" in capsys.readouterr().out
     assert peak_mb() - before_mb < 300
 
 
-def test_a_batch_that_lies_about_its_size_is_refused_unread() -> None:
-    file = io.BytesIO()
-    schema = pa.schema([("a", pa.float64())])
-    writer = pa.ipc.new_stream(file, schema, options=pa.ipc.IpcWriteOptions(compression="zstd"))
-    writer.write_batch(pa.record_batch([np.zeros(1000)], schema=schema))
-    writer.close()
-    data = file.getvalue()
-    require_bounded(data)
-    place = data.rfind(struct.pack("<q", 8000))
-    for size in (2**40, -(2**62)):
-        with pytest.raises(pa.ArrowInvalid, match="exceeds the limit of 64"):
-            require_bounded(data[:place] + struct.pack("<q", size) + data[place + 8 :])
-
-
-def test_a_batch_with_fewer_rows_than_it_says_is_not_read(folder: Path, capsys: Said) -> None:
-    """Arrow takes a head's count of rows as it is, and reads what lies behind the buffer."""
-    path = folder / "columns" / "ticks-000.arrows"
-    rows = 1234
-    schema = pa.schema([("mono_s", pa.float64())])
-    stream = SealedStream(path, schema)
-    stream.write(pa.record_batch([np.arange(rows) / 50], schema=schema))
-    stream.close()
-    forged = path.read_bytes().replace(struct.pack("<q", rows), struct.pack("<q", 100 * rows))
-    path.write_bytes(sealed_again(forged))
-    assert run(["runs", "show", str(folder)]) == 0
-    assert "ticks-000.arrows: damaged or truncated after batch 0" in capsys.readouterr().out
-
-
 def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Said) -> None:
-    path = folder / "columns" / "shapes-000.arrows"
-    path.write_bytes(sealed_again(path.read_bytes().replace(b"fringes", b"fr\xff\xfe\xfdes")))
+    path = folder / "shapes" / "shapes-0000.parquet"
+    table = pq.read_table(path)
+    binary = pa.array([b"fr\xff\xfe\xfdes"] * table.num_rows)
+    place = table.schema.get_field_index("kind")
+    forged = table.set_column(place, "kind", pa.Array.from_buffers(pa.string(), table.num_rows, binary.buffers()))
+    pq.write_table(forged, path)
     assert run(["runs", "show", str(folder)]) == 0
+    assert run(["replay", str(folder)]) in (0, 2, 3)
     capsys.readouterr()
-
-
-def test_seals_over_seals_are_given_up() -> None:
-    """Each says that the rest of the file is its message."""
-    seal = b"seal:%04x%08x%08x" % (0, 1_000_000, 1)
-    assert unseal(seal * 100_000).data == b""
 
 
 def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None:
     """Words where numbers belong, a column twice, lists of nothing: said, and the run is shown without."""
-    for number, schema in enumerate(
-        (
-            pa.schema([("mono_s", pa.string())]),
-            pa.schema([("mono_s", pa.float64())] * 2),
-            pa.schema([("x", pa.null())]),
-        )
-    ):
-        stream = SealedStream(folder / "columns" / f"ticks-00{number}.arrows", schema)
-        stream.write(pa.RecordBatch.from_arrays([pa.nulls(9, kind) for kind in schema.types], schema=schema))
-        stream.close()
+    schemas = (
+        pa.schema([("mono_s", pa.string())]),
+        pa.schema([("mono_s", pa.float64())] * 2),
+        pa.schema([("x", pa.null())]),
+    )
+    for number, schema in enumerate(schemas):
+        table = pa.Table.from_arrays([pa.nulls(9, kind) for kind in schema.types], schema=schema)
+        pq.write_table(table, folder / "ticks" / f"ticks-{number:04d}.parquet")
     assert run(["runs", "show", str(folder)]) == 0
     assert "without mono_s" in capsys.readouterr().out
-
-
-def test_a_segment_of_a_terabyte_of_nothing(folder: Path, capsys: Said) -> None:
-    with (folder / "night-000.rrd").open("r+b") as file:
-        file.truncate(2**40)
-    assert run(["repair", str(folder), "--json"]) == 0
-    (found,) = (row for row in json.loads(capsys.readouterr().out)["files"] if row["file"] == "night-000.rrd")
-    assert "MB outside any message" in found["action"]
-
-
-@pytest.mark.parametrize("kind", [2, 3])
-def test_a_message_that_claims_the_rest_of_a_terabyte(folder: Path, capsys: Said, kind: int) -> None:
-    """It is within its file, which is sparse: what is whole in front of it is read, and no more memory taken."""
-    path = folder / "night-000.rrd"
-    whole = whole_messages(path)
-    with path.open("r+b") as file:
-        file.truncate(whole[-1].start)
-        file.seek(whole[-1].start)
-        file.write(struct.pack("<QQ", kind, 2**39))
-        file.truncate(2**40)
-    shutil.rmtree(folder / "columns")  # the segments are all there is
-    assert whole_messages(path) == whole[:-1]
-    assert run(["runs", "show", str(folder)]) in {0, 3}
-    assert "night-000.rrd" in capsys.readouterr().out
-
-
-def test_where_rerun_gives_up_python_goes_on() -> None:
-    class PanicException(BaseException):  # as PyO3 names it, and what it is
-        pass
-
-    with pytest.raises(RuntimeError, match="Rerun failed on it"), panics_are_faults():
-        raise PanicException("index out of bounds")
-    with pytest.raises(KeyboardInterrupt), panics_are_faults():
-        raise KeyboardInterrupt
-
-
-def test_a_message_of_a_segment_that_would_be_huge(folder: Path, capsys: Said) -> None:
-    path = folder / "night-000.rrd"
-    data = bytearray(path.read_bytes())
-    place = data.index(b"\x18", data.index(b"membrane_ctrl\x10\x02"))  # uncompressed_size, behind compression = 2
-    data[place + 1 : place + 3] = b"\xff\xff"
-    data[place + 3 : place + 3] = b"\xff\xff\x7f"
-    path.write_bytes(data)
-    assert run(["repair", str(folder)]) == 0
-    assert "which no recorder writes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -420,9 +336,9 @@ def test_no_control_byte_of_a_run_is_printed(folder: Path, capsys: Said) -> None
     summary = json.loads((folder / "summary.json").read_text())
     summary.pop("crc32")
     (folder / "summary.json").write_text(dumps_checked({**summary, "exit": HOSTILE}))
-    ticks = folder / "columns" / "ticks-000.arrows"
-    program = PROGRAM.encode()
-    ticks.write_bytes(sealed_again(ticks.read_bytes().replace(program, HOSTILE.encode()[: len(program)])))
+    part = folder / "inputs" / "inputs-0000.parquet"
+    table = pq.read_table(part)
+    pq.write_table(table.replace_schema_metadata({"program": HOSTILE, "first_row": HOSTILE}), part)
     folder = folder.rename(folder.with_name(f"{RUN}-\x1b[31m"))
     for words in (
         ("runs", "--logs", str(folder.parent)),

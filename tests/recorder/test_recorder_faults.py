@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 from membrane_ctrl.config import toml_file as config_file
@@ -24,10 +25,9 @@ from membrane_ctrl.recorder import sink
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
 from membrane_ctrl.recorder.sink import Recording, RecordingError
-from membrane_ctrl.run_files.column_file import Journal
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from membrane_ctrl.run_files.run_folder import write_config
-from membrane_ctrl.run_files.sealed_stream import SealedStream, whole_batches
+from membrane_ctrl.run_files.table_store.disk import Disk
 from tests.support.rrd_reading import scalars
 from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
@@ -175,7 +175,8 @@ def test_a_segment_deleted_under_the_recorder_is_reported_and_another_begun(benc
 
 def emptied(folder: Path) -> None:
     """As an `rm -r` leaves it that met a file just written."""
-    shutil.rmtree(folder / "columns")
+    for path in folder.glob("*/"):
+        shutil.rmtree(path)
     for path in folder.glob("*.*"):
         path.unlink()
 
@@ -217,8 +218,8 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
     assert json.loads((run_dir / "events.jsonl").read_text())["kind"] == "mark"
     found = json.loads((run_dir / "summary.json").read_text())
     assert (found["ticks"], found["recorder"]["folder_anew_s"]) == (150, 1.0)
-    rows = sum(batch.num_rows for batch in whole_batches(run_dir / "columns" / "ticks-000.arrows"))
-    assert rows == 150  # those of the first second still waited for a batch
+    rows = pq.read_metadata(run_dir / "ticks" / "ticks-0001.parquet").num_rows
+    assert rows == 100  # those of the first second were in the old folder
 
 
 def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None:
@@ -276,8 +277,7 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
 
     seconds(0, 3)
     with monkeypatch.context() as patch:
-        patch.setattr(SealedStream, "write", full)
-        patch.setattr(Journal, "keep", full)
+        patch.setattr(Disk, "write", full)
         seconds(3, 4)
         if not room_again:
             bench.recorder.finish(in_haste=True)
@@ -286,7 +286,7 @@ def test_inputs_that_met_a_full_disk_come_later_or_are_counted(
         bench.recorder.finish(in_haste=True)
     found = [int(tick) for frame in InputsReader(bench.run_dir) for tick in frame.records["tick"]]
     account = json.loads((bench.run_dir / "summary.json").read_text())["recorder"]
-    assert found == list(range(1, 450 if room_again else 150))  # what the journal had before
+    assert found == list(range(1, 450 if room_again else 150))
     assert account["input_ticks_lost"] == (0 if room_again else 200)
 
 

@@ -265,8 +265,8 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
         kinds = [report["kind"] for report in received(status)]
     assert kinds == ["recorder_error", "recorder_recovered", "recorder_done"]
     account = summary_of(run_dir)["recorder"]
-    lost = dict.fromkeys(("rows_lost", "column_rows_lost", "events_lost", "input_ticks_lost", "restarts"), 0)
-    assert account["tables"]["ticks"] == len(list((run_dir / "columns").glob("ticks-*")))
+    lost = dict.fromkeys(("rows_lost", "table_rows_lost", "events_lost", "input_ticks_lost", "restarts"), 0)
+    assert account["tables"]["ticks"] == len(list((run_dir / "ticks").glob("ticks-*")))
     said = {"errors": 1, "partial": False, "folder_anew_s": None}
     assert account == {"segments": account["segments"], "tables": account["tables"]} | said | lost
     assert has_footer(run_dir / "test-001.rrd")

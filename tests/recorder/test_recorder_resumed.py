@@ -22,9 +22,8 @@ from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ri
 from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder, load_state, save_state
 from membrane_ctrl.recorder.sink import EventsFile, Recording, is_whole
-from membrane_ctrl.replay.repair import read_rows
 from membrane_ctrl.run_files.disk_budget import DetailLevel
-from tests.support.rrd_reading import has_footer, reader, scalars, strings
+from tests.support.rrd_reading import has_footer, reader, recorded_rows, scalars, strings
 from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 ROWS = rows_of(12.0)
@@ -95,7 +94,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 def recorded(run_dir: Path) -> np.ndarray:
-    return np.concatenate([read_rows(path) for path in sorted(run_dir.glob("*.rrd"))])
+    return np.concatenate([recorded_rows(path) for path in sorted(run_dir.glob("*.rrd"))])
 
 
 def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, stack: ExitStack) -> None:

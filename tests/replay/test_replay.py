@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.recorded_hold import ring_trip
@@ -27,17 +28,13 @@ from membrane_ctrl.controller.tick import (
     unpack_tick,
 )
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.plain_json import with_comment
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
-from membrane_ctrl.model.telemetry import unpack
-from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
-from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.replay import replay as replay_module
 from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay
-from membrane_ctrl.run_files import tables
+from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from tests.support.incidents import check_incident, read_incident
 from tests.support.synthetic_shape import shape_at
@@ -87,7 +84,7 @@ def test_the_record_of_the_run_has_what_it_should_show() -> None:
     assert sum(inputs.estimate is not None for inputs, _ in TICKS) >= 9
 
 
-def changed_from(tick: int) -> type[Controller]:
+def changed_from(tick: int, step: float = 1e-3) -> type[Controller]:
     """Today's code, with a change that shows from a tick on."""
 
     class Changed(Controller):
@@ -95,7 +92,7 @@ def changed_from(tick: int) -> type[Controller]:
             outputs = super().tick(inputs)
             if outputs.row.tick < tick:
                 return outputs
-            return replace(outputs, row=replace(outputs.row, pump_fraction=outputs.row.pump_fraction + 1e-12))
+            return replace(outputs, row=replace(outputs.row, pump_fraction=outputs.row.pump_fraction + step))
 
     return Changed
 
@@ -107,7 +104,7 @@ def test_a_difference_is_found_at_its_first_tick(
     assert run(["replay", str(record)]) == Exit.REJECTED
     said = capsys.readouterr().out
     assert f"different  {len(TICKS) - 699} ticks, the first is tick 700 at 14.000 s" in said
-    assert "not in the *.rrd files" in said
+    assert "pump_fraction: recorded" in said
 
 
 def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) -> None:
@@ -149,7 +146,8 @@ def test_run_and_part_are_named_as_for_a_review(
 def test_missing_ticks_are_a_gap_and_nothing_is_claimed_behind_it(
     record: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shutil.rmtree(record / "columns")
+    for path in record.glob("*/"):
+        shutil.rmtree(path)
     write_record(record, TICKS, range(510, 521))
     assert run(["replay", str(record), "--json"]) == Exit.REJECTED
     report = report_of(capsys)
@@ -224,7 +222,7 @@ def test_an_incident_too_large_for_a_repository_is_refused_and_leaves_nothing(
     assert not list((tmp_path / "tests" / "incidents").iterdir())
 
 
-@pytest.mark.parametrize("missing", ["config.toml", "columns"])
+@pytest.mark.parametrize("missing", ["config.toml", "inputs"])
 def test_what_is_no_run_is_one_line(record: Path, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
     (record / missing).rename(record.parent / "elsewhere")
     assert run(["replay", str(record)]) == Exit.BAD_INPUT
@@ -233,44 +231,46 @@ def test_what_is_no_run_is_one_line(record: Path, missing: str, capsys: pytest.C
     assert missing in said
 
 
-def test_a_damaged_batch_of_the_tables_is_a_gap(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "_TICK_BATCH_S", 2.0)
-    shutil.rmtree(record / "columns")
+def test_a_damaged_row_group_of_the_inputs_is_a_gap(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = replace(table_specs.INPUTS, group_rows=100)
+    monkeypatch.setattr(table_specs, "INPUTS", small)
+    specs = tuple(small if spec.name == small.name else spec for spec in table_specs.ALL)
+    monkeypatch.setattr(table_specs, "ALL", specs)
+    for path in record.glob("*/"):
+        shutil.rmtree(path)
     write_record(record, TICKS)
-    path = record / "columns" / "ticks-000.arrows"
+    path = record / "inputs" / "inputs-0000.parquet"
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 16] = bytes(16)
     path.write_bytes(data)
     reader = InputsReader(record)
     gaps = [item for item in recorded_ticks(reader) if isinstance(item, Gap)]
-    assert 50 <= sum(gap.ticks for gap in gaps if gap.reason == "not recorded") <= 151
+    assert 100 <= sum(gap.ticks for gap in gaps if gap.reason == "not recorded") <= 300
     assert len(reader.damage) == 1
 
 
 def test_shapes_without_their_times_are_damage(record: Path) -> None:
-    (path,) = (record / "columns").glob("shapes*.arrows")
-    path.unlink()
-    with path.open("wb") as file, pa.ipc.new_stream(file, pa.schema([("sag_change_um", pa.float64())])) as stream:
-        stream.write_table(pa.table({"sag_change_um": [1.0]}))
+    (path,) = (record / "shapes").glob("shapes*.parquet")
+    pq.write_table(pa.table({"sag_change_um": [1.0]}), path)
+    (record / "shapes" / "manifest.jsonl").unlink()
     reader = InputsReader(record)
     assert sum(len(frame.estimates) for frame in reader) == 0
     assert any("shapes" in line and "time_s" in line for line in reader.damage)
 
 
+@pytest.mark.parametrize(("step", "shown"), [(2.0**-10, True), (1e-12, False)])
 def test_a_difference_is_shown_with_what_was_recorded(
-    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], step: float, shown: bool
 ) -> None:
-    rows = unpack([outputs.row.pack() for _, outputs in TICKS])
-    recording = Recording(record, "night", RunClock.start(), CONFIG)
-    recording.next_segment()
-    TelemetryStreams(recording, CONFIG).send(rows)
-    recording.close()
-    monkeypatch.setattr(replay_module, "Controller", changed_from(720))
+    monkeypatch.setattr(replay_module, "Controller", changed_from(720, step))
     assert run(["replay", str(record), "--json"]) == Exit.REJECTED
     report = report_of(capsys)
-    then = TICKS[719][1].row.pump_fraction
+    then = round(TICKS[719][1].row.pump_fraction * 2**18) / 2**18
     assert report["first_different"] == {"tick": 720, "time_s": TICKS[719][0].now_s}
-    assert report["fields"] == {"pump_fraction": [then, then + 1e-12]}
+    assert report["fields"] == ({"pump_fraction": [then, then + step]} if shown else {})
     assert run(["replay", str(record)]) == Exit.REJECTED
-    assert f"pump_fraction: recorded {then!r}, today {then + 1e-12!r}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert (
+        f"pump_fraction: recorded {then!r}, today {then + step!r}" in said if shown else "smaller difference" in said
+    )

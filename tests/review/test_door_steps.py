@@ -10,7 +10,7 @@ from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import pressure_steps
 from membrane_ctrl.review.events.laser_and_door import quantum, update_s
 from membrane_ctrl.review.events.steps import FoundEvent
-from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
+from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 
 HOURS = 2.0
 AMBIENT = COLUMN["ambient_pressure_pa"]

@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review.events.found import find_events, laser_losses, noise_changes, weather_losses
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
-from membrane_ctrl.run_files.tables import TICK_FIELDS, Columns, first_level
+from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
 from tests.support.synthetic_shape import from_estimates
 
 HOURS = 2.0

@@ -9,7 +9,7 @@ from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.steps import FoundEvent
-from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
+from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from tests.support.synthetic_shape import from_estimates
 
 BAND_UM = 2.0

@@ -43,7 +43,7 @@ def _with_ticks(folder: Path, rows: Rows, kept: np.ndarray) -> Path:
     """A run whose levels are of all rows, and its ticks some of them."""
     write_run(folder, iter([(rows, [])]))
     write_run(folder / "thin", iter([(rows[kept], [])]))
-    shutil.copy(folder / "thin" / "columns" / "ticks-000.arrows", folder / "columns")
+    shutil.copytree(folder / "thin" / "ticks", folder / "ticks", dirs_exist_ok=True)
     return folder
 
 
@@ -67,8 +67,8 @@ def test_seconds_without_every_tick_are_those_of_the_level(tmp_path: Path) -> No
     assert [odd.name for odd in thinned.anomalies if odd not in every.anomalies] == ["thinned ticks"]
     assert every.benefit is not None
     assert thinned.benefit is None
-    for path in (tmp_path / "some" / "columns").glob("levels*"):
-        path.unlink()
+    for path in (tmp_path / "some").glob("ticks_*"):
+        shutil.rmtree(path)
     bare = analyse(open_run(tmp_path / "some"))
     assert bare.ticks.uncovered_s == pytest.approx(thinned.ticks.thin_s, abs=2)
     assert any("held not counted" in odd.seen for odd in bare.anomalies)

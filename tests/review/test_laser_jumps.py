@@ -9,7 +9,7 @@ from benchmarks.nights import DOOR, GLITCH, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import laser_glitches
 from membrane_ctrl.review.events.steps import FoundEvent
-from membrane_ctrl.run_files.tables import TICK_FIELDS, first_level
+from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 
 HOURS = 2.0
 AT_S = 3000.3

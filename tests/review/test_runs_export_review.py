@@ -121,7 +121,7 @@ def test_a_run_without_an_end_is_as_long_as_what_it_has(tmp_path: Path) -> None:
     (folder / "summary.json").unlink()
     assert [entry.exit for entry in entries(tmp_path, Filter(least_s=359.0))] == ["open"]
     assert entries(tmp_path, Filter(least_s=370.0)) == []
-    shutil.rmtree(folder / "columns")
+    shutil.rmtree(folder / "ticks_1s")
     assert np.isnan(entries(tmp_path)[0].duration_s)
 
 

@@ -11,7 +11,7 @@ from benchmarks.nights import night
 from membrane_ctrl.model.telemetry import COLUMN
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import analyse
-from membrane_ctrl.run_files.column_reader import recorded_rate_hz
+from membrane_ctrl.run_files.recorded_rate import recorded_rate_hz
 from membrane_ctrl.run_files.run_folder import understood
 from tests.support.review_runs import tables, written
 
@@ -69,7 +69,7 @@ def test_the_rate_is_that_of_the_ticks(folder: Path, text: str | None) -> None:
 def test_without_ticks_the_seconds_know_the_rate(tmp_path: Path) -> None:
     folder = written(tmp_path, HOURS)
     assert recorded_rate_hz(folder) == 10.0
-    for path in (folder / "columns").glob("ticks*"):
+    for path in (folder / "ticks").glob("ticks*"):
         path.unlink()
     assert recorded_rate_hz(folder) == 10.0
     assert recorded_rate_hz(tmp_path) is None

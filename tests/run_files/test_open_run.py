@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,9 @@ from benchmarks.nights import night
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.telemetry import FIELDS, column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.run_files.column_file import FILE_S
-from membrane_ctrl.run_files.tables import CODES, NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
-from tests.support.review_runs import fields_recorded, same, segment, set_summary, tables, written
+from membrane_ctrl.run_files.levels import CODES, NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
+from membrane_ctrl.run_files.table_store.spec import PART_S
+from tests.support.review_runs import same, set_summary, tables, written
 
 
 def level_of(rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -75,23 +76,6 @@ def test_nothing_finite_gives_nan_and_no_warning() -> None:
     assert len(SIGNALS) * 3 + 6 == len(NAMES)
 
 
-def test_a_killed_run_ends_in_its_rerun_segment(tmp_path: Path) -> None:
-    rows, shapes = night(3, 0.05, "typical", [])
-    tables(tmp_path, rows, shapes, close=False)
-    segment(tmp_path, rows)
-    for path in (tmp_path / "columns").glob("*-waiting.arrows"):
-        path.unlink()
-    run = open_run(tmp_path)
-    table = run.ticks(fields_recorded())
-    assert table.num_rows == len(rows)
-    assert same(table.column("displacement_um").to_numpy(), column(rows, "displacement_um"), 1e-4)
-    assert any("summary.json" in note for note in run.notes)
-    for window_s in (1.0, 10.0, 60.0):
-        level = run.level(window_s)
-        assert level["rows"].sum() == len(rows)
-        assert (np.diff(level["time_s"]) > 0).all()
-
-
 def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:
     rows, shapes = night(3, 0.05, "typical", [])
     tables(tmp_path, rows, shapes, close=False)
@@ -99,54 +83,42 @@ def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:
     assert run.ticks().num_rows == len(rows)
     assert run.level(60.0)["rows"].sum() == len(rows)
     assert len(run.shapes()) == len(shapes)
-    files = {path.name for path in (tmp_path / "columns").iterdir()}
-    assert {"ticks-waiting.arrows", "ticks-000.arrows", "levels_60s-waiting.arrows"} <= files
+    files = {path.name for path in tmp_path.rglob("*-0000.*")}
+    assert {"ticks-0000.journal", "shapes-0000.journal", "ticks_1s-0000.journal"} <= files
 
 
-def test_a_cycle_that_the_journal_repeats_counts_once(tmp_path: Path) -> None:
-    rows, shapes = night(3, 0.05, "typical", [])
-    tables(tmp_path, rows, shapes)
-    columns = tmp_path / "columns"
-    (columns / "shapes-waiting.arrows").write_bytes((columns / "shapes-000.arrows").read_bytes())
-    found = open_run(tmp_path).shapes()
-    assert len(found) == len(shapes)
-    assert (np.diff(found.time_s) > 0).all()
-
-
-@pytest.mark.parametrize("table", ["levels_1s", "shapes"])
+@pytest.mark.parametrize("table", ["ticks_1s", "shapes"])
 def test_a_missing_file_of_any_table_is_named(tmp_path: Path, table: str) -> None:
     folder = written(tmp_path, 0.02)
-    (folder / "columns" / f"{table}-000.arrows").rename(folder / "columns" / f"{table}-001.arrows")
-    assert any(f"{table}-000.arrows: missing" in note for note in open_run(folder).notes)
+    (folder / table / f"{table}-0000.parquet").unlink()
+    assert any(f"{table}-0000.parquet: missing" in note for note in open_run(folder).notes)
 
 
-def test_a_run_without_tables_is_read_from_rerun(tmp_path: Path) -> None:
-    rows, _ = night(4, 0.02, "typical", [])
-    segment(tmp_path, rows)
-    (tmp_path / "summary.json").write_text('{"schema": "membrane-summary/2"}')
-    run = open_run(tmp_path)
-    assert run.ticks().num_rows == len(rows)
-    assert run.level(1.0)["rows"].sum() == len(rows)
-    assert len(run.shapes()) == 0
-    assert any("tables of ticks are missing" in note for note in run.notes)
+def test_a_run_without_its_table_of_ticks_says_so(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.02)
+    shutil.rmtree(folder / "ticks")
+    run = open_run(folder)
+    assert "the table of ticks is missing" in run.notes
+    assert run.ticks().num_rows == 0
+    assert run.level(1.0)["rows"].sum() > 0
 
 
 def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.2)
-    path = folder / "columns" / "ticks-000.arrows"
+    path = folder / "ticks" / "ticks-0000.parquet"
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     run = open_run(folder)
-    assert 2000 < run.ticks().num_rows < 6000
-    last_s = run.ticks(["time_s"]).column("time_s")[-1].as_py()
-    assert any("ticks-000.arrows: truncated" in note and f"after {last_s:.2f} s" in note for note in run.notes)
+    assert run.ticks(["error_um"]).num_rows == 7200, "its column lies in the first two thirds"
+    assert run.ticks().num_rows == 0
+    assert any("ticks-0000.parquet: rows from 0.00 s to 719.90 s are left out" in note for note in run.notes)
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.05)
-    (folder / "columns" / "ticks-000.arrows").write_bytes(b"\xff" * 4000)
+    (folder / "ticks" / "ticks-0000.parquet").write_bytes(b"\xff" * 4000)
     run = open_run(folder)
     assert run.ticks().num_rows == 0
-    assert any("ticks-000.arrows: cannot be read" in note for note in run.notes)
+    assert any("ticks-0000.parquet: its footer is damaged" in note for note in run.notes)
     assert run.level(1.0)["time_s"].size > 0
 
 
@@ -156,13 +128,13 @@ def test_a_missing_file_is_named_and_the_rest_is_there(tmp_path: Path) -> None:
     one, _ = night(5, 0.02, "typical", [])
     parts = [one.copy() for _ in range(3)]
     for number, part in enumerate(parts):
-        part[:, FIELDS.index("mono_s")] += 1.1 * FILE_S * number
+        part[:, FIELDS.index("mono_s")] += 1.1 * PART_S * number
     rows = np.concatenate(parts)
     tables(folder, rows, [])
-    assert len(list((folder / "columns").glob("ticks-*"))) == 3
-    (folder / "columns" / "ticks-001.arrows").unlink()
+    assert len(list((folder / "ticks").glob("ticks-*"))) == 3
+    (folder / "ticks" / "ticks-0001.parquet").unlink()
     run = open_run(folder)
-    assert any("ticks-001.arrows: missing" in note for note in run.notes)
+    assert any("ticks-0001.parquet: missing" in note for note in run.notes)
     assert run.ticks(["error_um"]).num_rows == len(rows) * 2 // 3
 
 

@@ -20,7 +20,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("inside", [".", "columns", "columns/../."])
+@pytest.mark.parametrize("inside", [".", "ticks", "ticks/../."])
 def test_nothing_is_exported_over_a_run(tmp_path: Path, capsys: Capsys, inside: str) -> None:
     folder, other = written(tmp_path / "a", 0.01), written(tmp_path / "b", 0.01)
     before = contents(tmp_path)

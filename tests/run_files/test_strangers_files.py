@@ -155,9 +155,9 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
     "processes/child.py",
-    "run_files/sealed_stream.py", "recorder/recorder.py",
+    "recorder/recorder.py",
     "run_files/table_store/disk.py", "run_files/table_store/part_writer.py",
-    "run_files/column_file.py", "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
+    "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
     "acquisition/raw_frames.py",
     # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
     "run_files/latched_fault.py", "run_files/disk_budget.py", "control_port/sockets.py",
@@ -165,7 +165,7 @@ _OWN = {
     # the machine's own folder of locks, whose owner and mode are checked
     "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named
-    "sim/optics/simulate.py", "replay/command.py", "run_files/segment_salvage.py", "review/viewer/command.py",
+    "sim/optics/simulate.py", "replay/command.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "calibration/report.py", "geometry/spread_file.py", "commissioning/devices.py",
     # the project's own pages

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,7 +20,6 @@ from membrane_ctrl.recorder.blueprint import FAULT, STATE
 from membrane_ctrl.recorder.process import THUMBNAIL_INTERVAL_S, Thumbnails
 from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams
 from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.run_files.rrd_reader import read_shapes
 from membrane_ctrl.run_files.streams import (
     DERIVED,
     MARKS,
@@ -29,7 +29,7 @@ from membrane_ctrl.run_files.streams import (
     mean_row,
     overview_um,
 )  # fmt: skip
-from tests.support.rrd_reading import entities, scalars
+from tests.support.rrd_reading import scalars
 from tests.support.synthetic_run import rows_of, shape_of
 
 
@@ -143,19 +143,18 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
             shapes.rebase(1.5)
         shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle, displacement_um=7.0 * cycle))
     recording.close()
-    read = read_shapes(tmp_path / "test-000.rrd", [])
-    assert read["sag_um"] == pytest.approx([0.0, 100.0, 0.0, 100.0])
-    assert read["displacement_um"] == pytest.approx([0.0, 7.0, 0.0, 7.0])
-    assert read["sag_sigma_um"] == pytest.approx(4 * [0.1])
+    _, values = scalars(tmp_path / "test-000.rrd", "/shape/sag_change", "Measurements:values")
+    _, variances = scalars(tmp_path / "test-000.rrd", "/shape/sag_change", "Measurements:variances")
+    assert values[:, 0] == pytest.approx([0.0, 100.0, 0.0, 100.0])
+    assert values[:, 1] == pytest.approx([0.0, 7.0, 0.0, 7.0])
+    assert variances[:, 0] == pytest.approx(4 * [0.01])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16"])
-def test_thumbnails_come_at_their_interval(tmp_path: Path, dtype: str) -> None:
+def test_thumbnails_come_at_their_interval(dtype: str) -> None:
     ring = FrameRing(4, 512, 600, dtype)
     writer = FrameWriter(ring.address)
-    recording = Recording(tmp_path, "test", RunClock.start(), Config())
-    recording.next_segment()
-    thumbnails = Thumbnails(recording, ring.address)
+    thumbnails = Thumbnails(ring.address)
 
     def take(pattern: str) -> None:
         slot = writer.begin()
@@ -163,17 +162,17 @@ def test_thumbnails_come_at_their_interval(tmp_path: Path, dtype: str) -> None:
         slot.commit(pattern, 0.0, 0.0, 0)
 
     take("x_sin_0")
-    thumbnails.send(0.0)
+    made = thumbnails.take_due(0.0)
     take("x_sin_1")
-    thumbnails.send(THUMBNAIL_INTERVAL_S - 1)  # too early
+    assert thumbnails.take_due(THUMBNAIL_INTERVAL_S - 1) == []
     take("x_sin_2")
     take("x_sin_3")
     take("y_sin_0")  # x_sin_0 and what was too early ...
     take("y_sin_1")  # ... has been overwritten by now
-    thumbnails.send(THUMBNAIL_INTERVAL_S)
-    recording.close()
-    frames = {path for path in entities(tmp_path / "test-000.rrd") if path.startswith("/frames/")}
-    assert frames == {f"/frames/{name}" for name in ("x_sin_0", "x_sin_2", "x_sin_3", "y_sin_0", "y_sin_1")}
+    made += thumbnails.take_due(THUMBNAIL_INTERVAL_S)
+    assert [each.pattern for each in made] == ["x_sin_0", "x_sin_2", "x_sin_3", "y_sin_0", "y_sin_1"]
+    picture = cv2.imdecode(np.frombuffer(made[0].jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (256, 300)
     thumbnails.close()
     writer.close()
     ring.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +18,16 @@ from membrane_ctrl.run_files.table_store.manifest import read_manifest
 from membrane_ctrl.run_files.table_store.part_writer import chunk_span
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.writer import TableWriter
-from tests.support.table_disk import TABLE, KillingDisk, batch_of, read_counts
+from tests.support.table_disk import TABLE as LARGE_TABLE
+from tests.support.table_disk import KillingDisk, batch_of, read_counts
 
 STEP_S = 60.0  # sixty rows a part
+TABLE = replace(LARGE_TABLE, group_rows=20)
 
 
 @pytest.fixture
-def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def run_dir(tmp_path: Path) -> Path:
     """A table of two parts, each of three row groups, and a journal."""
-    monkeypatch.setattr(spec, "GROUP_ROWS", 20)
-    monkeypatch.setattr("tests.support.table_disk.STEP_S", STEP_S)
     writer = TableWriter(tmp_path, TABLE, disk=KillingDisk())
     for first in range(0, 150, 5):
         writer.add(batch_of(range(first, first + 5), STEP_S))

@@ -16,7 +16,7 @@ from membrane_ctrl.review import open_run
 from membrane_ctrl.review.runs import export
 from membrane_ctrl.run_files.run import Run
 from membrane_ctrl.run_files.streams import named_table
-from tests.support.review_runs import segment, tables
+from tests.support.review_runs import tables
 
 ORIGIN = datetime(2026, 11, 21, 18, 0, 0, 250_000, tzinfo=UTC)
 
@@ -95,17 +95,6 @@ def test_a_part_without_data_has_the_same_columns(folder: Path) -> None:
         assert none.column_names == whole.column_names
         assert none.num_rows == 0
         assert none.column("time_utc").type == pa.timestamp("us", "UTC")
-
-
-def test_ticks_of_tables_and_segments_are_one_table(folder: Path, tmp_path: Path) -> None:
-    rows, shapes = night(3, 0.05, "typical", [])
-    tables(tmp_path, rows, shapes, close=False)
-    segment(tmp_path, rows)
-    (tmp_path / "columns" / "ticks-waiting.arrows").unlink()
-    ticks = open_run(tmp_path).ticks(["state", "error_um"])
-    assert ticks.num_rows == len(rows)
-    assert set(ticks.column("state").to_pylist()) == {"hold"}
-    assert ticks.column("time_utc").null_count == 0
 
 
 def test_a_csv_has_words_and_empty_cells(folder: Path, tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.run_files.streams import STREAMS
-from membrane_ctrl.run_files.tables import ColumnTables
+from membrane_ctrl.run_files.run_tables import RunTables
 
 NAME = "20261121T180000Z-night"
+_SYNC_ROWS = 120
 
 
 def written(logs: Path, hours: float, events: list[Planted] | None = None, seed: int = 1, name: str = NAME) -> Path:
@@ -47,19 +47,16 @@ def segment(folder: Path, rows: Rows) -> Path:
 
 def tables(folder: Path, rows: Rows, shapes: list[ShapeEstimate], close: bool = True) -> None:
     """The tables of a run; without `close` as a killed recorder leaves them."""
-    made = ColumnTables(folder)
+    made = RunTables(folder)
     for first in range(0, len(rows), 10):
+        if first % _SYNC_ROWS == 0:
+            made.sync()
         made.add_ticks(batch_of(rows[first : first + 10]))
     for estimate in shapes:
         made.add_shape(estimate)
     made.sync()
     if close:
         made.close()
-
-
-def fields_recorded() -> list[str]:
-    """Telemetry fields that Rerun holds."""
-    return [line.field for stream in STREAMS for line in stream.lines]
 
 
 def same(a: np.ndarray, b: np.ndarray, atol: float) -> bool:

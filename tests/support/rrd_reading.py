@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 from rerun.chunk import RrdReader
 
+from membrane_ctrl.model.telemetry import COLUMN, FIELDS
+from membrane_ctrl.run_files.streams import STREAMS
+
 
 def scalars(path: Path, entity: str, component: str = "Scalars:scalars") -> tuple[np.ndarray, np.ndarray]:
     """Times in s of the run (n,) and values (n, m) of one entity, sorted by time."""
@@ -56,3 +59,17 @@ def has_footer(path: Path) -> bool:
     except (RuntimeError, ValueError):
         return False
     return True
+
+
+def recorded_rows(path: Path) -> np.ndarray:
+    """(n, len(FIELDS)) telemetry rows of a segment, by time; fields not recorded are NaN."""
+    found = {stream.path: scalars(path, stream.path) for stream in STREAMS}
+    axis_s = np.unique(np.concatenate([times for times, _ in found.values()]))
+    rows = np.full((len(axis_s), len(FIELDS)), np.nan)
+    rows[:, COLUMN["mono_s"]] = axis_s
+    for stream in STREAMS:
+        times, values = found[stream.path]
+        if len(times):
+            places = np.searchsorted(axis_s, times)
+            rows[places[:, np.newaxis], [COLUMN[line.field] for line in stream.lines]] = values
+    return rows

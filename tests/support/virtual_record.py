@@ -20,7 +20,7 @@ from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, Virtu
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.run_files.tables import ColumnTables
+from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.synthetic_shape import shape_at
@@ -103,14 +103,16 @@ def batches_of(
     return batches
 
 
-def write_tables(folder: Path, batches: list[Batch]) -> None:
-    """The tables of a run, closed."""
-    tables = ColumnTables(folder)
+def write_tables(folder: Path, batches: list[Batch], close: bool = True) -> None:
+    """The tables of a run; without `close` as a killed recorder leaves them."""
+    tables = RunTables(folder)
     for batch, shapes in batches:
         for estimate in shapes:
             tables.add_shape(estimate)
         tables.add_ticks(batch)
-    tables.close()
+        tables.sync()
+    if close:
+        tables.close()
 
 
 def write_record(
@@ -118,10 +120,11 @@ def write_record(
     ticks: list[tuple[TickInputs, TickOutputs]],
     lost: range = range(0),
     memories: Mapping[int, bytes] | None = None,
+    close: bool = True,
 ) -> None:
     """The run's folder: configuration, tables, events; ticks of `lost` are not in it."""
     write_head(folder, ticks)
-    write_tables(folder, batches_of(ticks, lost, memories))
+    write_tables(folder, batches_of(ticks, lost, memories), close)
 
 
 def write_head(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:

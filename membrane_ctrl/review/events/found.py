@@ -8,7 +8,7 @@ from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.events import laser_and_door as doors
 from membrane_ctrl.review.events import steps
-from membrane_ctrl.run_files import summary, tables
+from membrane_ctrl.run_files import levels, summary
 from membrane_ctrl.run_files.shapes import Shapes
 
 # Columns of the 1 s level used here.
@@ -78,7 +78,7 @@ def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
 
 def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
     """Steps of the holding flow that the weather (the feed-forward) does not explain."""
-    minutes = tables.coarser_level(_held(level), 60.0)
+    minutes = levels.coarser_level(_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
     leak = minutes["mean_flow_um_per_s"] - np.nan_to_num(minutes["mean_feedforward_um_per_s"])
     leak = np.where(whole, leak, np.nan)

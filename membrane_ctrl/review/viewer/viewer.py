@@ -18,8 +18,7 @@ from rerun.experimental import ViewerClient
 
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import open_plain
-from membrane_ctrl.run_files.rrd_reader import segments
-from membrane_ctrl.run_files.segments import first_message_after
+from membrane_ctrl.run_files.segments import first_message_after, segments
 
 # Work to do while a viewer is open, until the question whether it is still open is answered with no.
 Meanwhile: TypeAlias = Callable[[Callable[[], bool]], None]

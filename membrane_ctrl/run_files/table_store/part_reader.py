@@ -25,13 +25,14 @@ from membrane_ctrl.run_files.table_store.part_writer import FIRST_ROW, MAGIC, TA
 
 # An hour at 200 Hz is 40 MB, an hour of thumbnails 9 MB.
 PART_BYTES_MAX = 400_000_000
-# A row group of 30 000 rows: the widest column is the upper half of a covariance in singles, 80 MB.
-CHUNK_BYTES_MAX = 120_000_000
-GROUP_BYTES_MAX = 400_000_000
+# A row group of 30 000 ticks with 60 columns is 15 MB, one of 3000 covariances 16 MB.
+CHUNK_BYTES_MAX = 60_000_000
+GROUP_BYTES_MAX = 120_000_000
 GROUP_ROWS_MAX = 1_000_000
 GROUPS_MAX = 10_000
 _THRIFT_ITEMS_MAX = 1_000_000
 _HASH_BYTES = 1 << 20
+_VALUE_BYTES = 8  # of a number in memory, at most
 _FAULTS = (pa.ArrowException, OSError, ValueError)
 
 
@@ -132,8 +133,8 @@ class PartReader:
             if chunk.path_in_schema.partition(".")[0] not in wanted:
                 continue
             total_bytes += self._checked_bytes(number, place, chunk, group.num_rows)
-        if total_bytes > GROUP_BYTES_MAX:
-            raise ValueError("more than a recorder writes")
+            if total_bytes > GROUP_BYTES_MAX:
+                raise ValueError("more than a recorder writes")
         table = self._parquet.read_row_group(number, columns=list(names), use_threads=False)
         return _plain(table.select(list(names)))
 
@@ -147,11 +148,13 @@ class PartReader:
         if expected is not None and zlib.crc32(data) != expected:
             raise ValueError(f"column {chunk.path_in_schema} is damaged")
         found = page_headers.measure_chunk(data)
-        listed = self.schema.field(chunk.path_in_schema.partition(".")[0]).type
-        most_values = rows * (listed.list_size if isinstance(listed, pa.FixedSizeListType) else 1)
-        if found.values > most_values or found.unpacked_bytes > CHUNK_BYTES_MAX:
+        kind = self.schema.field(chunk.path_in_schema.partition(".")[0]).type
+        most_values = rows * (kind.list_size if isinstance(kind, pa.FixedSizeListType) else 1)
+        # a repeated value takes no room in the file, but its own in memory
+        size_bytes = max(found.unpacked_bytes, most_values * _VALUE_BYTES)
+        if found.values > most_values or size_bytes > CHUNK_BYTES_MAX:
             raise ValueError(f"column {chunk.path_in_schema} is larger than a recorder writes")
-        return found.unpacked_bytes
+        return size_bytes
 
     def _expected_crc32(self, number: int, place: int) -> int | None:
         """Checksum of a column of a row group, from the manifest; None without one."""

@@ -39,12 +39,14 @@ class TableReader:
         self._folder = run_dir / table.name
         self._table = table
         self._notes = notes
-        self._entries = read_manifest(self._folder, notes)
+        damage: list[str] = []
+        self._entries = read_manifest(self._folder, damage)
+        notes += [line for line in damage if line not in notes]
         found = {n for path in self._folder.glob("*-*") if (n := spec.file_number(path)) is not None}
         self.numbers = sorted(found | set(self._entries))[:_NUMBERS_MAX]
         for entry in self._entries.values():
-            for damage in entry.damage:
-                self._note(self._part(entry.number), f"its journal was damaged, {damage}")
+            for text in entry.damage:
+                self._note(self._part(entry.number), f"its journal was damaged, {text}")
 
     @property
     def exists(self) -> bool:
@@ -92,6 +94,25 @@ class TableReader:
             if found and found[-1].num_rows:
                 return found[-1].column(name)[-1]
         return None
+
+    def metadata(self) -> dict[str, str]:
+        """The table's own metadata, as in its first readable file: program, format."""
+        for number in self.numbers:
+            schema = self._schema_of(number)
+            if schema is not None:
+                pairs = (schema.metadata or {}).items()
+                return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in pairs}
+        return {}
+
+    def _schema_of(self, number: int) -> pa.Schema | None:
+        try:
+            if self._part(number).exists():
+                with PartReader(self._part(number), self._entries.get(number)) as part:
+                    return part.schema
+            frames = journal.find_frames(read_bytes(self._journal(number), journal.FILE_BYTES_MAX))
+            return journal.read_schema(frames[0]) if frames and not frames[0].rows else None
+        except _FAULTS:
+            return None
 
     def check_all(self) -> None:
         """Compare every part with its SHA-256, and note those that differ."""
@@ -145,7 +166,7 @@ class TableReader:
 
     def _journal_tables(self, path: Path, data: bytes, names: Sequence[str]) -> Iterator[pa.Table]:
         try:
-            for block in journal.read_journal(data, spec.GROUP_ROWS, self._table.schema):
+            for block in journal.read_journal(data, self._table.group_rows, self._table.schema):
                 if isinstance(block, journal.LostBytes):
                     self._note(path, describe_lost_bytes(block))
                     continue

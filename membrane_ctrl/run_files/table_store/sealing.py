@@ -23,7 +23,7 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
     if target.exists() and number in read_manifest(folder, []):
         disk.remove(source)
         return
-    rows = _JournalRows(read_bytes(source, FILE_BYTES_MAX), table.schema)
+    rows = _JournalRows(read_bytes(source, FILE_BYTES_MAX), table)
     try:
         entry = write_part(disk, target, number, rows.first_row, rows.groups(), table.time_name)
     except (ValueError, pa.ArrowException) as error:
@@ -37,21 +37,22 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
 class _JournalRows:
     """The rows of a journal, read once; `damage` describes what is lost of it."""
 
-    def __init__(self, data: bytes, schema: pa.Schema) -> None:
+    def __init__(self, data: bytes, table: spec.TableSpec) -> None:
         self.damage: list[str] = []
-        self._blocks = read_journal(data, spec.GROUP_ROWS, schema)
+        self._group_rows = table.group_rows
+        self._blocks = read_journal(data, table.group_rows, table.schema)
         self._first = self._next_block()
         self.first_row = self._first.first_row if self._first is not None else 0
 
     def groups(self) -> Iterator[pa.Table]:
-        """Tables of about `GROUP_ROWS` rows."""
+        """Tables of about `group_rows` rows."""
         waiting: list[pa.Table] = []
         count = 0
         block = self._first
         while block is not None:
             waiting.append(block.table)
             count += block.table.num_rows
-            if count >= spec.GROUP_ROWS:
+            if count >= self._group_rows:
                 yield pa.concat_tables(waiting).combine_chunks()
                 waiting, count = [], 0
             block = self._next_block()

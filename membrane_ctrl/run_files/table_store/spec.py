@@ -7,7 +7,7 @@ import pyarrow as pa
 
 # A part holds at most this much of a run, so that a damaged file costs at most an hour.
 PART_S = 3600.0
-# A row group is the smallest unit that is read or lost: 10 minutes at 50 Hz.
+# 10 minutes of ticks at 50 Hz.
 GROUP_ROWS = 30_000
 PART_SUFFIX = ".parquet"
 JOURNAL_SUFFIX = ".journal"
@@ -27,11 +27,14 @@ class TableSpec:
         Its columns; units and descriptions are metadata of the fields.
     time_name : str
         A column of rising seconds of the run.
+    group_rows : int
+        Rows of a row group, the smallest unit that is read or lost.
     """
 
     name: str
     schema: pa.Schema
     time_name: str
+    group_rows: int = GROUP_ROWS
 
 
 def part_path(folder: Path, number: int) -> Path:

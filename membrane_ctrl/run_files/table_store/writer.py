@@ -93,7 +93,8 @@ class TableWriter:
         return self.until_s - self._journal_from_s >= spec.PART_S or current.size_bytes >= journal.JOURNAL_BYTES_MOST
 
     def _begin_journal(self, first_s: float) -> None:
-        path = spec.journal_path(self._folder, self._number)
+        while (path := spec.journal_path(self._folder, self._number)).exists():
+            self._number += 1  # left by another recorder
         self._journal = journal.JournalWriter(self._disk, path, self._table.schema)
         self._journal_from_s = first_s
         self._number += 1
@@ -163,7 +164,7 @@ class TableWriter:
     def _note_journal(self, number: int) -> None:
         with contextlib.suppress(OSError, ValueError, pa.ArrowException):
             data = read_bytes(spec.journal_path(self._folder, number), journal.FILE_BYTES_MAX)
-            for block in journal.read_journal(data, spec.GROUP_ROWS, self._table.schema):
+            for block in journal.read_journal(data, self._table.group_rows, self._table.schema):
                 if isinstance(block, journal.JournalBlock):
                     last_s = float(block.table.column(self._table.time_name)[-1].as_py())
                     self._note_rows(block.first_row + block.table.num_rows, last_s)

@@ -10,14 +10,13 @@ import pytest
 
 from benchmarks.nights import batch_of
 from membrane_ctrl.model.telemetry import Rows, unpack
-from membrane_ctrl.run_files.column_file import Journal
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.run_files.tables import ColumnTables
+from membrane_ctrl.run_files.run_tables import RunTables
 from tests.support.synthetic_run import rows_of, shape_of
 
 ROWS: Rows = unpack([row.pack() for row in rows_of(200.0)])
 SECONDS = range(200)
-KILLED = (3, 61, 62, 150)  # before the first batch, just after one, twice in a row, in the middle
+KILLED = (3, 61, 62, 150)  # twice in a row among them
 
 
 def second(number: int) -> Rows:
@@ -30,7 +29,7 @@ def ticks_of(folder: Path) -> np.ndarray:
     return found
 
 
-def feed(tables: ColumnTables, number: int) -> None:
+def feed(tables: RunTables, number: int) -> None:
     tables.add_ticks(batch_of(second(number)))
     tables.add_shape(shape_of(float(number), number))
     tables.sync()
@@ -38,14 +37,14 @@ def feed(tables: ColumnTables, number: int) -> None:
 
 @pytest.mark.parametrize("repeated", [0, 1], ids=["the state was newer", "the state was older"])
 def test_after_four_deaths_every_tick_window_and_shape_is_there_once(tmp_path: Path, repeated: int) -> None:
-    tables = ColumnTables(tmp_path)
+    tables = RunTables(tmp_path)
     handed_on = deepcopy(tables.open_windows)
     for number in SECONDS:
         feed(tables, number)
         if number in KILLED:
             if not repeated:
                 handed_on = deepcopy(tables.open_windows)
-            tables = ColumnTables(tmp_path, handed_on)
+            tables = RunTables(tmp_path, resumed=handed_on)
             if repeated:
                 feed(tables, number)
         handed_on = deepcopy(tables.open_windows)
@@ -57,44 +56,23 @@ def test_after_four_deaths_every_tick_window_and_shape_is_there_once(tmp_path: P
         assert (np.diff(level["time_s"]) == window_s).all()
         assert level["rows"].sum() == len(ROWS)
     assert np.array_equal(run.shapes().time_s, np.array(SECONDS, dtype=float))
-    assert not list((tmp_path / "columns").glob("*waiting*"))
+    assert not list(tmp_path.rglob("*.journal"))
 
 
-def test_what_waits_is_on_the_disk_each_second(tmp_path: Path) -> None:
-    tables = ColumnTables(tmp_path)
-    for number in range(70):
+def test_what_is_added_is_on_the_disk_each_second(tmp_path: Path) -> None:
+    tables = RunTables(tmp_path)
+    for number in range(5):
         feed(tables, number)
-        if number < 3 or number > 55:  # a batch is a minute
-            assert len(ticks_of(tmp_path)) == 50 * (number + 1)
+        assert len(ticks_of(tmp_path)) == 50 * (number + 1)
 
 
-def test_of_a_torn_journal_the_whole_batches_are_taken_over(tmp_path: Path) -> None:
-    tables = ColumnTables(tmp_path)
+def test_of_a_torn_journal_the_whole_frames_are_taken_over(tmp_path: Path) -> None:
+    tables = RunTables(tmp_path)
     for number in range(10):
         feed(tables, number)
-    journal = tmp_path / "columns" / "ticks-waiting.arrows"
+    journal = tmp_path / "ticks" / "ticks-0000.journal"
     journal.write_bytes(journal.read_bytes()[:-100])
-    again = ColumnTables(tmp_path, tables.open_windows)
+    again = RunTables(tmp_path, resumed=tables.open_windows)
     feed(again, 10)
     again.close()
     assert np.array_equal(ticks_of(tmp_path), np.delete(ROWS[:550, 1], slice(450, 500)))
-
-
-def test_a_disk_without_room_for_the_journal_loses_nothing_while_the_recorder_lives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(self: Journal, waiting: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    tables = ColumnTables(tmp_path)
-    feed(tables, 0)
-    with monkeypatch.context() as patch:
-        patch.setattr(Journal, "_begin", full)
-        tables._ticks._journal.drop()
-        tables.add_ticks(batch_of(second(1)))
-        with pytest.raises(OSError, match="No space"):
-            tables.sync()
-    feed(tables, 2)
-    tables.close()
-    assert np.array_equal(ticks_of(tmp_path), ROWS[:150, 1])
-    assert tables.lost == 0

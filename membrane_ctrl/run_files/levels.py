@@ -1,0 +1,136 @@
+"""Overview levels: minimum, mean and maximum of each signal per 1, 10 and 60 s, so that a month opens in seconds.
+
+A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows` (ticks in it), the
+codes at its end (of some the largest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.model import telemetry
+from membrane_ctrl.model.arrays import Column
+from membrane_ctrl.model.columns import AGGREGATED, COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Kind
+
+Columns = dict[str, Column]
+
+WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
+# Minimum, mean and maximum of these, and the codes, as the table of columns says.
+SIGNALS: tuple[str, ...] = tuple(each.name for each in AGGREGATED)
+CODES: tuple[str, ...] = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
+_LARGEST = tuple(name for name in CODES if COLUMNS[name].aggregation is Aggregation.LARGEST)
+NAMES: tuple[str, ...] = (
+    "time_s",
+    "rows",
+    *CODES,
+    *(f"{kind}_{name}" for name in SIGNALS for kind in ("min", "mean", "max")),
+)
+# The telemetry fields from which levels are computed.
+_OF_TRUE_ERROR = ("target_um", "truth_displacement_um")
+TICK_FIELDS: tuple[str, ...] = tuple(
+    dict.fromkeys(("mono_s", *CODES, *(name for name in SIGNALS if name in COLUMNS), *_OF_TRUE_ERROR))
+)
+
+
+def first_level(ticks: Mapping[str, Column]) -> Columns:
+    """The 1 s level of consecutive ticks; incomplete windows are included."""
+    time_s = ticks["mono_s"]
+    if not time_s.size:
+        return {name: np.empty(0) for name in NAMES}
+    starts, window = _windows(time_s, WINDOWS_S[0])
+    level: Columns = {"time_s": window, "rows": _counts(starts, time_s.size)}
+    level |= _codes(ticks, starts)
+    for name in SIGNALS:
+        values = telemetry.true_error_um(ticks) if name == TRUE_ERROR_COLUMN.name else ticks[name]
+        level[f"min_{name}"] = np.fmin.reduceat(values, starts)
+        level[f"mean_{name}"] = _mean(values, np.ones(values.size), starts)
+        level[f"max_{name}"] = np.fmax.reduceat(values, starts)
+    return level
+
+
+def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
+    """A level of longer windows from a finer one; means are weighted by the number of ticks.
+
+    The coarser level lacks the signals and codes that the finer one lacks.
+    """
+    if not level["time_s"].size:
+        return {name: np.empty(0) for name in level}
+    starts, window = _windows(level["time_s"], window_s)
+    coarse: Columns = {"time_s": window, "rows": np.add.reduceat(level["rows"], starts)}
+    coarse |= _codes(level, starts)
+    for name, values in level.items():
+        if name.startswith("mean_"):
+            coarse[name] = _mean(values, level["rows"], starts)
+        elif name.startswith(("min_", "max_")):
+            coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(values, starts)
+    return coarse
+
+
+def _windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
+    """First row of each non-empty window, and the windows' starts in s."""
+    # a small fraction of a window: 59.9999999 means 60
+    number = np.floor(time_s / window_s + 1e-9)
+    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    return starts, number[starts] * window_s
+
+
+def _counts(starts: NDArray[np.intp], size: int) -> Column:
+    return np.diff(np.append(starts, size)).astype(np.float64)
+
+
+def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
+    size = next(iter(table.values())).size
+    last = np.append(starts[1:], size) - 1
+    codes = {name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table}
+    return codes | {name: np.fmax.reduceat(table[name], starts) for name in _LARGEST if name in table}
+
+
+def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
+    there = np.isfinite(values)
+    total = np.add.reduceat(np.where(there, weights, 0.0), starts)
+    # sum relative to a nearby value: a double can then hold 1e5 Pa and a change of mPa without loss
+    base = np.where(there, values, 0.0)[starts]
+    offset = np.repeat(base, np.diff(np.append(starts, values.size)))
+    summed = np.add.reduceat(np.where(there, (values - offset) * weights, 0.0), starts)
+    return np.where(total > 0, base + summed / np.where(total > 0, total, 1.0), np.nan)
+
+
+@dataclass(slots=True)
+class OpenWindows:
+    """Unfinished windows of the overview, which a successor of a dead recorder needs to finish."""
+
+    # rows of the open 1 s window
+    ticks: Columns = field(default_factory=lambda: {name: np.empty(0) for name in TICK_FIELDS})
+    # by the coarser window in s: rows of the finer level in its open window
+    levels: dict[float, Columns] = field(default_factory=dict)
+
+    def finished_rows(self, new: Columns | None) -> Iterator[tuple[float, Columns]]:
+        """Take the `TICK_FIELDS` of ticks, and yield the rows of each level, by its window in s, that are finished.
+
+        None: the run is over, all are finished.
+        """
+        ticks = self.ticks
+        if new is not None:
+            ticks = {name: np.concatenate((ticks[name], new[name])) for name in TICK_FIELDS}
+        done = ticks["mono_s"].size if new is None else _first_of_last(ticks["mono_s"], WINDOWS_S[0])
+        self.ticks = {name: values[done:] for name, values in ticks.items()}
+        level = first_level({name: values[:done] for name, values in ticks.items()})
+        yield WINDOWS_S[0], level
+        for coarse_s in WINDOWS_S[1:]:
+            waiting = self.levels.get(coarse_s)
+            if waiting is not None:
+                level = {name: np.concatenate((waiting[name], level[name])) for name in NAMES}
+            done = level["time_s"].size if new is None else _first_of_last(level["time_s"], coarse_s)
+            self.levels[coarse_s] = {name: values[done:] for name, values in level.items()}
+            level = coarser_level({name: values[:done] for name, values in level.items()}, coarse_s)
+            yield coarse_s, level
+
+
+def _first_of_last(time_s: np.ndarray, window_s: float) -> int:
+    """Number of rows before the last row's window, which may be unfinished."""
+    if not time_s.size:
+        return 0
+    number = np.floor(time_s / window_s + 1e-9)
+    return int(np.searchsorted(number, number[-1]))

@@ -1,0 +1,200 @@
+"""The tables of a run: their names and columns, with unit and description in the metadata of each field."""
+
+import numpy as np
+import pyarrow as pa
+
+from membrane_ctrl import __version__
+from membrane_ctrl.controller.tick import RECORD, SAME
+from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, TelemetryColumn, unit_of
+from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
+from membrane_ctrl.run_files import levels
+from membrane_ctrl.run_files.table_store.spec import TableSpec
+
+FORMAT = "membrane-table/1"
+PROGRAM = f"membrane-ctrl {__version__}"
+# Fields of a tick's record that are no column of its telemetry row, and are not repeated in it: the table of inputs.
+INPUT_FIELDS: tuple[str, ...] = tuple(name for name in RECORD.names or () if name not in SAME or name == "now_s")
+# By the field of a record: the column of the telemetry row with that reading or time, exact or derived.
+ROW_COLUMNS: dict[str, str] = {
+    name: SAME.get(name, name) for name in RECORD.names or () if SAME.get(name, name) in COLUMNS
+}
+# Computed numbers are rounded to a power of two that is finer than any sensor (the laser's 0.1 nm): a third of the
+# bytes of a day. Readings and commands are exact.
+_RESOLUTION = {"µm": 2.0**-14, "µm/s": 2.0**-14, "σ": 2.0**-10, "": 2.0**-18}
+# The covariance of one cycle in this time is enough for a report: a month of all would be 3 GB.
+COVARIANCE_INTERVAL_S = 600.0
+# A row of these holds 3 kB, a thumbnail 10 kB.
+_SHAPE_GROUP_ROWS = 3_000
+_THUMBNAIL_GROUP_ROWS = 500
+
+
+def _field(name: str, kind: pa.DataType, description: str, unit: str | None = None, **more: str) -> pa.Field:
+    about = {"description": description, "unit": unit_of(name) if unit is None else unit, **more}
+    return pa.field(name, kind, metadata={key: text for key, text in about.items() if text})
+
+
+def _spec(name: str, fields: list[pa.Field], time_name: str = "time_s", group_rows: int = 30_000) -> TableSpec:
+    about = {"format": FORMAT, "table": name, "program": PROGRAM}
+    return TableSpec(name, pa.schema(fields, metadata=about), time_name, group_rows)
+
+
+def _tick_field(column: TelemetryColumn) -> pa.Field:
+    if column.kind is not Kind.QUANTITY:
+        return _field(column.name, pa.int64(), column.description)
+    if is_exact(column.name):
+        return _field(column.name, pa.float64(), column.description)
+    resolution = resolution_of(column.name)
+    about = {"resolution": repr(resolution)} if resolution else {}
+    return _field(column.name, pa.float32(), column.description, **about)
+
+
+def is_exact(name: str) -> bool:
+    """Whether a column of a tick's row is a reading or a time, and recorded to the bit."""
+    return name in ROW_COLUMNS.values()
+
+
+def resolution_of(name: str) -> float | None:
+    """Step to which a computed column is rounded; None for one that is not rounded."""
+    return None if is_exact(name) else _RESOLUTION.get(COLUMNS[name].unit)
+
+
+def _input_field(name: str) -> pa.Field:
+    kind = pa.from_numpy_dtype(RECORD[name])
+    if name == "now_s":
+        return _field("time_s", kind, COLUMNS["mono_s"].description)
+    if name in COLUMNS:
+        return _field(name, kind, f"{COLUMNS[name].description}, as it was read")
+    return _field(name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading"))
+
+
+_INPUT_TEXTS = {
+    "flags": "bit 0: the link was up; bit 1: there was a reading",
+    "estimate_time_s": "time of the shape estimate that arrived in this tick; NaN without one",
+    "output_crc": "CRC-32 of the tick's outputs",
+    "tail_bytes": "size of the tick's commands and ended tasks in the table of rare inputs",
+}
+
+TICKS = _spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
+INPUTS = _spec("inputs", [_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)])
+RARE = _spec(
+    "rare",
+    [
+        _field("time_s", pa.float64(), "start of the tick"),
+        _field("tick", pa.int64(), "number of the tick"),
+        _field(
+            "kind", pa.string(), "commands: commands and ended tasks of the tick, as JSON; memory: before the tick"
+        ),
+        _field("data", pa.binary(), "the commands or the memory"),
+    ],
+)
+
+_SHAPE_TEXTS = {
+    "time_s": "middle of the exposures",
+    "hencky_um": "amplitude of the part of a Hencky bowl that the Zernike terms lack, as sag",
+    "sag_um": "height at the rim above the vertex",
+    "sag_sigma_um": "standard deviation of changes of the sag",
+    "displacement_um": "mean reading of the laser during the exposures",
+    "slope_residual_urad": "RMS of measured minus fitted slopes",
+    "valid_fraction": "share of the aperture with a slope",
+    "modulation_median_adu": "median modulation of the fringes",
+    "saturated_fraction": "share of saturated pixels",
+    "latency_s": "from the last frame to the result",
+    "geometry_sag_sigma_um": "standard deviation of the sag that all cycles share",
+}
+
+
+def _shape_fields() -> list[pa.Field]:
+    return [
+        *(_field(name, pa.float64(), _SHAPE_TEXTS.get(name, "")) for name in shape_estimate.NUMBERS),
+        _field("cycle", pa.int64(), "number of the cycle or frame"),
+        _field("tracking_lost", pa.bool_(), "phases cannot be tracked from here: a full cycle is needed"),
+        _field("kind", pa.string(), "full, fringes or track"),
+        _field("verdict", pa.string(), "ok, degraded or rejected"),
+        _field("reason", pa.string(), "why it is not ok"),
+        _field("coeffs_um", pa.list_(pa.float64(), ZERNIKE_TERMS), "Zernike coefficients, Noll 1..."),
+        _field(
+            "sigma_um", pa.list_(pa.float32(), ZERNIKE_TERMS), "standard deviation of changes of the coefficients"
+        ),
+        _field(
+            "upper_um2",
+            pa.list_(pa.float32(), COVARIANCE_UPPER_SIZE),
+            "upper half of the coefficients' covariance, row by row",
+            "µm²",
+        ),
+    ]
+
+
+SHAPES = _spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS)
+TRACKED = _spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS)
+COVARIANCES = _spec(
+    "covariances",
+    [
+        _field("time_s", pa.float64(), "time of the cycle"),
+        _field(
+            "covariance_um2",
+            pa.list_(pa.float32(), ZERNIKE_TERMS**2),
+            f"covariance of the coefficients, row by row; of a cycle in {COVARIANCE_INTERVAL_S:.0f} s",
+            "µm²",
+        ),
+    ],
+)
+
+
+def _level_field(name: str) -> pa.Field:
+    if name == "time_s":
+        return _field(name, pa.float64(), "start of the window")
+    if name == "rows":
+        return _field(name, pa.int64(), "ticks in the window")
+    if name in COLUMNS:
+        return _field(name, pa.int64(), COLUMNS[name].description)
+    how, _, signal = name.partition("_")
+    column = COLUMNS.get(signal, TRUE_ERROR_COLUMN)
+    wide = column.unit == "Pa"
+    return _field(name, pa.float64() if wide else pa.float32(), f"{_HOW[how]} of: {column.description}", column.unit)
+
+
+_HOW = {"min": "least value", "mean": "mean", "max": "greatest value"}
+
+
+def level_table(window_s: float) -> str:
+    """Name of the table of a level."""
+    return f"ticks_{window_s:.0f}s"
+
+
+LEVELS: dict[float, TableSpec] = {
+    window_s: _spec(level_table(window_s), [_level_field(name) for name in levels.NAMES])
+    for window_s in levels.WINDOWS_S
+}
+
+_EVENT_FIELDS = [
+    _field("number", pa.int64(), "of the event in the run, from 1"),
+    _field("time_s", pa.float64(), "when it was reported"),
+    _field("time_utc", pa.timestamp("us", "UTC"), "the same in UTC"),
+    _field("kind", pa.string(), "kind of the event"),
+    _field("text", pa.string(), "sentence for people"),
+    _field("data", pa.string(), "the line of events.jsonl"),
+]
+# events of several processes may be reported out of order
+EVENTS = _spec("events", _EVENT_FIELDS, "number")
+MARKS = _spec("marks", _EVENT_FIELDS, "number")
+THUMBNAILS = _spec(
+    "thumbnails",
+    [
+        _field("number", pa.int64(), "of the picture in the run, from 1"),
+        _field("time_s", pa.float64(), "middle of the exposure"),
+        _field("pattern", pa.string(), "the pattern on the screen"),
+        _field("jpeg", pa.binary(), "the picture"),
+    ],
+    "number",
+    _THUMBNAIL_GROUP_ROWS,
+)
+
+ALL: tuple[TableSpec, ...] = (
+    TICKS, INPUTS, RARE, SHAPES, TRACKED, COVARIANCES, *LEVELS.values(), EVENTS, MARKS, THUMBNAILS
+)  # fmt: skip
+
+
+def rounded(values: np.ndarray, resolution: float | None) -> np.ndarray:
+    """Values rounded to whole steps; as they are without a resolution."""
+    return values if resolution is None else np.round(values / resolution) * resolution
