@@ -19,7 +19,6 @@ from rich.live import Live
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import keys, model, why
-from membrane_ctrl.console.quantities import labelled
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.model import clock, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import EventLine
@@ -34,12 +33,12 @@ def line(view: model.ConsoleView) -> str:
         return f"{view.elapsed_s:9.1f} s  {silent}"
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
-        labelled(row, "error_um", sign=True, width=7),
+        row.labelled("error_um", sign=True, width=7),
         f"pump {why.percent(row.pump_fraction):>5}",
-        labelled(row, "leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
+        row.labelled("leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
         *([f"held by {why.holders(row)}"] if math.isfinite(row.estimate_sigma_um) else []),
-        f"shape {_shape_words(view)} {labelled(row, 'trim_um', sign=True)}",
-        labelled(row, "lateness_ms"),
+        f"shape {_shape_words(view)} {row.labelled('trim_um', sign=True)}",
+        row.labelled("lateness_ms"),
         view.why,
     ]
     parts += [f"LOCKED {lock}" for lock in view.locks]

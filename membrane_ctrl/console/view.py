@@ -12,7 +12,6 @@ from rich.text import Text
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
 from membrane_ctrl.console.model import ConsoleView, ShapeView
-from membrane_ctrl.console.quantities import labelled, quantity
 from membrane_ctrl.console.why import duration, holders, number, percent
 from membrane_ctrl.model import columns, telemetry
 from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
@@ -232,7 +231,7 @@ def _error(view: ConsoleView, config: Config) -> Text:
     inside = abs(row.error_um) <= config.limits.band_um
     style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
     error = COLUMNS["error_um"]
-    text = Text(f"{quantity(row, 'error_um', sign=True):>10}", style=style)
+    text = Text(f"{row.quantity('error_um', sign=True):>10}", style=style)
     mean, std = error.format_value(view.error_mean_um, sign=True), error.format_value(view.error_std_um)
     text.append(f"   last minute: mean {mean}, std {std} {error.unit}, ", style="default")
     text.append(f"{percent(view.in_band_fraction)} within ±{config.limits.band_um:g}", style="default")
@@ -257,19 +256,19 @@ _PLACED = frozenset({
 def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
     """Known values of the published columns of some groups that have no place of their own."""
     shown = [each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED]
-    return "".join(f"  {labelled(row, name)}" for name in shown if math.isfinite(getattr(row, name)))
+    return "".join(f"  {row.labelled(name)}" for name in shown if math.isfinite(getattr(row, name)))
 
 
 def _mirror(row: telemetry.TelemetryRow) -> Text:
-    text = Text.assemble("reading ", (quantity(row, "displacement_um", sign=True), "bold"))
+    text = Text.assemble("reading ", (row.quantity("displacement_um", sign=True), "bold"))
     text.append(
-        f"  {labelled(row, 'setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"
+        f"  {row.labelled('setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"
     )
     if math.isfinite(row.estimate_sigma_um):
-        text.append(f"  centre ± {quantity(row, 'estimate_sigma_um')} by {holders(row)}", style="green")
+        text.append(f"  centre ± {row.quantity('estimate_sigma_um')} by {holders(row)}", style="green")
     if math.isfinite(row.truth_displacement_um):
-        text.append(f"  truth {quantity(row, 'truth_displacement_um', sign=True)}", style="cyan")
-        text.append(f" (laser {quantity(row, 'truth_laser_bias_um', sign=True)})", style="dim")
+        text.append(f"  truth {row.quantity('truth_displacement_um', sign=True)}", style="cyan")
+        text.append(f" (laser {row.quantity('truth_laser_bias_um', sign=True)})", style="dim")
     return text
 
 
@@ -290,7 +289,7 @@ def _flow(row: telemetry.TelemetryRow) -> Text:
 
 
 def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
-    text = Text(labelled(row, "leak_um_per_s"))
+    text = Text(row.labelled("leak_um_per_s"))
     if view.too_tight:
         text.append(" too tight: open the bleed", style="bold yellow")
     return text.append(_others(row, columns.Group.ENVIRONMENT))
@@ -298,7 +297,7 @@ def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
 
 def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
-    state.append(f"  {labelled(row, 'trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}", style="default")
+    state.append(f"  {row.labelled('trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}", style="default")
     estimate = shape.estimate
     change = number(shape.sag_change_um, 3, sign=True)
     if change != MISSING:
@@ -318,7 +317,7 @@ def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, Ren
 
 def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     late = COLUMNS["lateness_ms"]
-    text = Text(f"{quantity(row, 'lateness_ms')}, worst of the minute {late.format_value(view.lateness_max_ms)}")
+    text = Text(f"{row.quantity('lateness_ms')}, worst of the minute {late.format_value(view.lateness_max_ms)}")
     text.append(f" {late.unit}{_others(row, columns.Group.TIMING)}")
     missed = int(row.missed_ticks)
     text.append(f", {missed} of {int(row.tick) + missed} ticks missed", style="yellow" if missed else "default")

@@ -54,6 +54,29 @@ class SafeLevel(IntEnum):
 class TelemetryRow(ColumnValues):
     """What one tick read, decided and wrote: its columns, and its bytes."""
 
+    def quantity(self, name: str, sign: bool = False, width: int = 0) -> str:
+        """Return the value of a column for people, with its unit: `+0.25 µm`.
+
+        Parameters
+        ----------
+        name : str
+            Column.
+        sign : bool
+            Whether a positive number has its sign.
+        width : int
+            Least width of the number.
+
+        Returns
+        -------
+        str
+        """
+        column = COLUMNS[name]
+        return f"{column.format_value(getattr(self, name), sign):>{width}} {column.unit}".rstrip()
+
+    def labelled(self, name: str, sign: bool = False, width: int = 0) -> str:
+        """Return a value with label and unit, `error +0.25 µm`; parameters as those of `quantity`."""
+        return f"{COLUMNS[name].short_label} {self.quantity(name, sign, width)}"
+
     def pack(self) -> bytes:
         """The row as doubles in field order."""
         return _STRUCT.pack(*_values(self))

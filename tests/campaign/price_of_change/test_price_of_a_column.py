@@ -1,7 +1,7 @@
 """A new telemetry column costs one row of the table and the line that computes it.
 
-The two are written into a copy of the source. Then the column is in the run's tables, in the recording and the viewer,
-in the report, on the page and the console, at the bridges and in the documentation.
+The two are written into a copy of the source. Then the column is in the run's tables, in recording and viewer, in the
+report, on page and console, at the bridges and in the documentation.
 """
 
 from __future__ import annotations
