@@ -45,7 +45,8 @@ Word = Annotated[int, Field(ge=0, le=0xFFFF)]
 _PORT = "Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."
 Port = Annotated[str, Field(min_length=1, description=_PORT)]
 _LINK = "Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."
-ModbusUrl = Annotated[str, Field(pattern=r"^(tcp|rtu)://.", description=_LINK)]
+MODBUS_URL_PATTERN = r"^(tcp|rtu)://."
+ModbusUrl = Annotated[str, Field(pattern=MODBUS_URL_PATTERN, description=_LINK)]
 _UNIT = "Modbus address of the device. Set it as stored in the device."
 UnitId = Annotated[int, Field(ge=1, le=247, description=_UNIT)]
 _SERIAL = "Serial number; empty: whichever answers. Set it to refuse any other instrument."

@@ -11,6 +11,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from firmware_iface.settings import MODBUS_URL_PATTERN
 from membrane_ctrl.model.errors import InputError, os_reason
 from membrane_ctrl.model.files import read_text
 
@@ -148,11 +149,11 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}" if field else message
     if kind == "missing":
         return f"{field}: missing; it has no default"
-    if "valid dictionary" in message:
+    if kind in ("dict_type", "model_type"):
         return f"{field}: write a table, [{field}] and its keys below"
     if kind == "tuple_type":
         return f"{field}: write a list, " + (f"[[{field}]] and its keys below" if inner else "in square brackets")
-    if kind == "string_pattern_mismatch" and "tcp|rtu" in message:
+    if kind == "string_pattern_mismatch" and error["ctx"]["pattern"] == MODBUS_URL_PATTERN:
         return f"{field}: {error['input']!r}: expected tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200"
     value = error["input"]
     shown = f" (it is {value!r})" if isinstance(value, (int, float, str, bool)) else ""

@@ -155,9 +155,9 @@ def _geometry(geometry: dict[str, Any] | None) -> str:
 def _watch(client: PortClient, first: dict[str, Any], period_s: float, as_json: bool) -> int:
     client.patience(period_s + 10.0)
     _print_watched(first, as_json)
-    for message in client.messages():
-        if "status" in message:
-            _print_watched(message["status"], as_json)
+    for streamed in client.messages():
+        if "status" in streamed:
+            _print_watched(streamed["status"], as_json)
     print("the run is over", file=sys.stderr)
     return errors.Exit.DONE
 

@@ -103,15 +103,15 @@ class Program:
     counts as one that has ended.
     """
 
-    def __init__(self, name: str, words: Sequence[str], log: Path, nice: int) -> None:
+    def __init__(self, name: str, arguments: Sequence[str], log: Path, nice: int) -> None:
         self.name = name
-        self._words, self._log, self._nice = words, log, nice
+        self._arguments, self._log, self._nice = arguments, log, nice
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         """Start the program without waiting."""
-        program = [sys.executable, "-m", "membrane_ctrl", *self._words]
-        stdin = subprocess.PIPE if "--with-hold" in self._words else subprocess.DEVNULL
+        program = [sys.executable, "-m", "membrane_ctrl", *self._arguments]
+        stdin = subprocess.PIPE if "--with-hold" in self._arguments else subprocess.DEVNULL
         with contextlib.suppress(OSError), _appending(self._log) as log:
             self._process = subprocess.Popen(program, stdin=stdin, stdout=log, stderr=log, process_group=0)
             os.setpriority(os.PRIO_PROCESS, self._process.pid, self._nice)

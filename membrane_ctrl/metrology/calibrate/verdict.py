@@ -111,8 +111,8 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
 
 def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A film that is not as the calibration was told, by a solution that knows nothing of it."""
-    told, problem = solution.problem.references.film, solution.problem
-    if told == "free":
+    film_kind, problem = solution.problem.references.film, solution.problem
+    if film_kind == "free":
         return []
     free = replace(problem, references=replace(problem.references, film="free"))
     try:
@@ -120,14 +120,14 @@ def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     except ValueError:
         return []
     freedom = len(film_law.BEYOND) * len(problem.sets)
-    fall = diagnose.film_rise(other, told)
+    fall = diagnose.film_rise(other, film_kind)
     if not other.converged or chi2.sf(fall, freedom) > diagnose.SURE:
         return []
     name = {
         "hencky": "Hencky's without pre-strain and nu = 0.3",
         "prestressed": "of the law, whatever its pre-strain",
     }
-    says = f"the film's figure is not {name[told]}: use --film free"
+    says = f"the film's figure is not {name[film_kind]}: use --film free"
     return [(fall - 2 * freedom, CalibrationFinding(True, says))]
 
 
