@@ -188,7 +188,7 @@ def test_track_a_set(changed: Product) -> None:
         assert (np.abs(off_um) < TRUE_SIGMAS * found["sag_sigma_um"]).all()
 
 
-@pytest.mark.parametrize("mode", ["fringes", "track"])
+@pytest.mark.parametrize("mode", ["cycle", "track"])
 def test_a_hold_is_recorded_replayed_and_reported(changed: Product, mode: str) -> None:
     run = changed.hold(mode)
     report = json.loads(changed.source.run_program("report", run, "--json"))
