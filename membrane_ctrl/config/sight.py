@@ -11,7 +11,7 @@ import numpy as np
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 
-_LEAST, _GOOD = 0.5, 0.9  # shares of the mirror: from less than half, 36 terms are not determined
+_LEAST, _GOOD = 0.5, 0.9  # shares of the mirror: from less than half, the terms are not determined
 _RINGS, _SPOKES = 20, 36
 _DEPTHS = np.linspace(0.0, 0.5, 26)  # of any bowl, over its radius
 

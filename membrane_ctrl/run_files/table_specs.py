@@ -34,9 +34,15 @@ def _field(name: str, kind: pa.DataType, description: str, unit: str | None = No
     return pa.field(name, kind, metadata={key: text for key, text in about.items() if text})
 
 
-def _spec(name: str, fields: list[pa.Field], time_name: str = "time_s", group_rows: int = 30_000) -> TableSpec:
-    about = {"format": FORMAT, "table": name, "program": PROGRAM}
-    return TableSpec(name, pa.schema(fields, metadata=about), time_name, group_rows)
+def _spec(
+    name: str,
+    fields: list[pa.Field],
+    time_name: str = "time_s",
+    group_rows: int = 30_000,
+    layout: tuple[tuple[str, str], ...] = (),
+) -> TableSpec:
+    about = {"format": FORMAT, "table": name, "program": PROGRAM, **dict(layout)}
+    return TableSpec(name, pa.schema(fields, metadata=about), time_name, group_rows, layout)
 
 
 def _tick_field(column: TelemetryColumn) -> pa.Field:
@@ -125,8 +131,9 @@ def _shape_fields() -> list[pa.Field]:
     ]
 
 
-SHAPES = _spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS)
-TRACKED = _spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS)
+_SHAPE_LAYOUT = (("zernike_terms", str(ZERNIKE_TERMS)),)
+SHAPES = _spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
+TRACKED = _spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
 COVARIANCES = _spec(
     "covariances",
     [
@@ -138,6 +145,7 @@ COVARIANCES = _spec(
             "µm²",
         ),
     ],
+    layout=_SHAPE_LAYOUT,
 )
 
 

@@ -131,6 +131,9 @@ def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
         raise ValueError("a frame that no recorder writes")
     batch = pa.ipc.read_record_batch(message, schema)
     batch.validate(full=True)  # otherwise Arrow trusts lengths and offsets
+    for column in batch.columns:  # Arrow accepts longer lists than those of the schema, and cuts them at other places
+        if isinstance(column, pa.FixedSizeListArray) and len(column.values) != len(column) * column.type.list_size:
+            raise ValueError("lists of another length than those of the schema")
     if batch.num_rows != frame.rows or batch.nbytes > FRAME_BYTES_MAX:
         raise ValueError("a frame that does not hold its stated rows")
     return batch

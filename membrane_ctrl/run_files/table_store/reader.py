@@ -177,12 +177,27 @@ class TableReader:
             self._note(path, f"cannot be read ({_reason(error)})")
 
     def _known(self, path: Path, schema: pa.Schema, names: Sequence[str]) -> list[str]:
-        """The columns of a file that are what a recorder writes under their names; none without the time."""
+        """The columns of a file that are what a recorder writes under their names.
+
+        None without the time, or if the file states another layout.
+        """
+        if (other := self._other_layout(schema)) is not None:
+            self._note(path, other)
+            return []
         known = [name for name in names if self._is_ours(schema, name)]
         absent = sorted(set(names) - set(known))
         if absent:
             self._note(path, f"without {', '.join(absent)}")
         return known if self._table.time_name in known or self._table.time_name not in names else []
+
+    def _other_layout(self, schema: pa.Schema) -> str | None:
+        """How a file's layout differs from the program's; None if it does not, or states none."""
+        stated = schema.metadata or {}
+        for name, own in self._table.layout:
+            found = stated.get(name.encode(), own.encode()).decode(errors="replace")[:20]
+            if found != own:
+                return f"written with {name.replace('_', ' ')} = {found}, this program has {own}: left out"
+        return None
 
     def _is_ours(self, schema: pa.Schema, name: str) -> bool:
         places = schema.get_all_field_indices(name)

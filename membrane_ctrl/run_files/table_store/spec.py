@@ -29,12 +29,16 @@ class TableSpec:
         A column of rising seconds of the run.
     group_rows : int
         Rows of a row group, the smallest unit that is read or lost.
+    layout : tuple of (str, str)
+        Names and values of the program's numbers on which the meaning of the columns depends. The schema's metadata
+        state them as well. A file that states others is not read.
     """
 
     name: str
     schema: pa.Schema
     time_name: str
     group_rows: int = GROUP_ROWS
+    layout: tuple[tuple[str, str], ...] = ()
 
 
 def part_path(folder: Path, number: int) -> Path:
