@@ -22,10 +22,9 @@ from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.metrology.uncertainty.budget import Budget
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
-from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
@@ -107,7 +106,7 @@ def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[
     """
     full = measurement.full
     radius_mm = measurement.head.optics.mirror.radius_mm
-    coeffs = [None] * ZERNIKE_TERMS if full is None else (1e3 * full.surface.coeffs_mm).tolist()
+    coeffs = [None] * zernike_terms.ZERNIKE_TERMS if full is None else (1e3 * full.surface.coeffs_mm).tolist()
     full_scale = 2**measurement.head.optics.camera.bits - 1
     quality: dict[str, Any] = {
         "verdict": measurement.verdict,

@@ -11,11 +11,10 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import columns
+from membrane_ctrl.model import columns, zernike_terms
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus, gains_words
-from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS
 from membrane_ctrl.run_files import shapes, streams
 
 SUMMARY_PATH = "/summary"
@@ -173,7 +172,7 @@ def _shape(config: Config) -> rrb.Vertical:
                   span=(-band_um, band_um), marks=True),
             _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
             rrb.BarChartView(
-                name=f"Change of Z2..Z{ZERNIKE_TERMS}, µm",
+                name=f"Change of Z2..Z{zernike_terms.ZERNIKE_TERMS}, µm",
                 origin=shapes.BARS_PATH,
                 plot_legend=rrb.PlotLegend(visible=False),
             ),
@@ -186,7 +185,7 @@ def _shape(config: Config) -> rrb.Vertical:
         ),
     ]  # fmt: skip
     if config.shape.mode == "track":
-        terms = f"Z{FIRST_FIGURE_INDEX} (top) to Z{ZERNIKE_TERMS}"
+        terms = f"Z{zernike_terms.FIRST_FIGURE_INDEX} (top) to Z{zernike_terms.ZERNIKE_TERMS}"
         fall = f"{terms}, change since hold began; a column a second, now on the right"
         heard = _plot("Vibrations heard in each minute, Hz", streams.VIBRATIONS.path)
         rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard))

@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from membrane_ctrl.controller import safety
-from membrane_ctrl.model import telemetry
+from membrane_ctrl.model import telemetry, zernike_terms
 from membrane_ctrl.model.arrays import Column, FloatArray
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
 from membrane_ctrl.model.columns import (
@@ -32,7 +32,6 @@ from membrane_ctrl.model.columns import (
 )
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import Rows, column
-from membrane_ctrl.model.zernike_terms import zernike_labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,7 @@ LOW_ORDERS = {
     11: ("spherical Z11 µm", RED),
 }
 
-ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"{label} µm", GREY) for label in zernike_labels()))
+ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"{label} µm", GREY) for label in zernike_terms.zernike_labels()))
 CHANGE = Stream("/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values()))
 PUMP = Stream("/pump/scale", (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)))
 VIBRATIONS = Stream("/shape/vibrations", tuple(Line("", f"mode {k} Hz", GREY) for k in range(1, 9)))

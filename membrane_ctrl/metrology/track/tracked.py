@@ -10,9 +10,8 @@ from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.compiled import sums_by
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter
 from membrane_ctrl.metrology.track.scene import CrossedScene
-from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.model import shape_estimate, zernike_terms
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray, Singles
-from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # Light of a square of the mirror against the median's: less or more is a hand, a lamp, a blind part of the screen.
 _COVERED = 0.25
@@ -29,7 +28,8 @@ _UNEVEN = 0.1  # of a square's light: as much of a fringe does not average out i
 _DARK = 0.3  # of the reference's light
 _STANDING_MM = 3e-3  # within it, the mean of frames is the frame of the mean: to a nanometre
 _STILL = 0.2  # share of the errors of the steps' fits that stays where these say nothing of a motion
-_NONE, _NO_COVARIANCE = np.full(ZERNIKE_TERMS, math.nan), np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), math.nan)
+_NONE = np.full(zernike_terms.ZERNIKE_TERMS, math.nan)
+_NO_COVARIANCE = np.full((_NONE.size, _NONE.size), math.nan)
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from membrane_ctrl.model import colours, events, run_events
+from membrane_ctrl.model import colours, events, run_events, zernike_terms
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.colours import Colour
 from membrane_ctrl.model.columns import DRAWN, ERROR, TelemetryColumn, aggregated_of, columns_of, plot_title, plots_of
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from membrane_ctrl.review.catalogue import one_line, span
 from membrane_ctrl.review.report.json import PumpSeen, timeline
 from membrane_ctrl.review.statistics import shape_review, spectra
@@ -292,7 +291,7 @@ def stability(shape: shape_review.ShapeReview) -> str:
 
 
 def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
-    noll = NOLL_INDICES[1:]
+    noll = zernike_terms.NOLL_INDICES[1:]
     rate = np.array([term.per_hour for term in shape.drift_um_per_hour])
     reach = np.array([(term.high - term.low) / 2 for term in shape.drift_um_per_hour])
     colours = [RED if term.significant else GREY for term in shape.drift_um_per_hour]
