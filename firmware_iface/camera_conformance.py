@@ -12,20 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from firmware_iface import roles
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.requirement import require, require_error
-from firmware_iface.roles import (
-    DeviceRefusedError,
-    DriverClock,
-    ExposingCamera,
-    Frame,
-    FrameLostError,
-    LinkDownError,
-    LinkError,
-    OpticalDevice,
-    Pixels,
-    SensorFormat,
-)
 
 _STEP_S = 1e-4  # that a reading of the clock takes: no two moments are the same
 _REPEATS = 3
@@ -61,16 +50,16 @@ class CameraBench:
         What the sensor sees.
     """
 
-    sensor = SensorFormat(48, 32)
+    sensor = roles.SensorFormat(48, 32)
     exposure_s = 0.0
 
     def __init__(self) -> None:
         time = VirtualTime()
-        self.clock = DriverClock(time.now, time.sleep)
+        self.clock = roles.DriverClock(time.now, time.sleep)
         self._random = np.random.default_rng(1)
-        self.scene: Pixels = np.zeros(self.sensor.shape, self.sensor.dtype)
+        self.scene: roles.Pixels = np.zeros(self.sensor.shape, self.sensor.dtype)
 
-    def make(self, sensor: SensorFormat) -> OpticalDevice:
+    def make(self, sensor: roles.SensorFormat) -> roles.OpticalDevice:
         """Make a driver that is configured for this sensor, not yet connected."""
         raise NotImplementedError
 
@@ -94,11 +83,11 @@ class CameraBench:
         """Bring it back."""
         raise NotImplementedError
 
-    def view(self) -> Pixels:
+    def view(self) -> roles.Pixels:
         """What the sensor sees now: for the emulator."""
         return self.scene.copy()
 
-    def change_scene(self) -> Pixels:
+    def change_scene(self) -> roles.Pixels:
         """Show another scene, and return it."""
         top = min(1 << self.sensor.bits, 1 << 16)
         self.scene = self._random.integers(0, top, self.sensor.shape).astype(self.sensor.dtype)
@@ -176,10 +165,11 @@ def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
     with _camera(bench) as camera:
         scene = bench.change_scene()
         camera.expose()
-        if isinstance(camera.driver, ExposingCamera):
+        if isinstance(camera.driver, roles.ExposingCamera):
             bench.change_scene()
         _require_picture(camera.fetch(), scene, "a frame whose exposure was over before the scene changed")
-        require_error(camera.driver.fetch if isinstance(camera.driver, ExposingCamera) else camera.fetch, LinkError)
+        fetch = camera.driver.fetch if isinstance(camera.driver, roles.ExposingCamera) else camera.fetch
+        require_error(fetch, roles.LinkError)
 
 
 def check_abandoned_exposure(bench: CameraBench) -> None:
@@ -199,7 +189,7 @@ def check_lost_frame(bench: CameraBench) -> None:
         bench.change_scene()
         bench.lose_frame()
         camera.expose()
-        require_error(camera.fetch, FrameLostError)
+        require_error(camera.fetch, roles.FrameLostError)
         scene = bench.change_scene()
         _require_picture(_retake(camera), scene, "the frame after a lost one")
 
@@ -211,7 +201,7 @@ def check_late_frame(bench: CameraBench) -> None:
         bench.change_scene()
         bench.delay_frame()
         camera.expose()
-        require_error(camera.fetch, FrameLostError)
+        require_error(camera.fetch, roles.FrameLostError)
         for _ in range(_REPEATS):
             scene = bench.change_scene()
             _require_picture(_retake(camera), scene, "a frame after a late one")
@@ -224,7 +214,7 @@ def check_frozen_camera(bench: CameraBench) -> None:
         camera.grab()
         bench.change_scene()
         bench.freeze()
-        require_error(camera.grab, LinkError)
+        require_error(camera.grab, roles.LinkError)
 
 
 def check_unplugged(bench: CameraBench) -> None:
@@ -232,8 +222,8 @@ def check_unplugged(bench: CameraBench) -> None:
     with _camera(bench) as camera:
         camera.grab()
         bench.unplug()
-        require_error(camera.grab, LinkError)
-        require_error(camera.open, LinkDownError)
+        require_error(camera.grab, roles.LinkError)
+        require_error(camera.open, roles.LinkDownError)
         bench.plug_in()
         camera.open()
         scene = bench.change_scene()
@@ -244,7 +234,7 @@ def check_other_sensor(bench: CameraBench) -> None:
     """A camera with a sensor of another size is refused, with both sizes."""
     other = replace(bench.sensor, width_px=bench.sensor.width_px + 16)
     with _driver(bench, other) as driver:
-        message = require_error(driver.open, DeviceRefusedError)
+        message = require_error(driver.open, roles.DeviceRefusedError)
         for width_px in (bench.sensor.width_px, other.width_px):
             require(str(width_px) in message, f"{message!r} does not name the width of {width_px} pixels")
 
@@ -281,7 +271,7 @@ _CHECKS: dict[Check, tuple[str, ...]] = {
 
 
 @contextmanager
-def _driver(bench: CameraBench, sensor: SensorFormat | None = None) -> Iterator[OpticalDevice]:
+def _driver(bench: CameraBench, sensor: roles.SensorFormat | None = None) -> Iterator[roles.OpticalDevice]:
     driver = bench.make(sensor or bench.sensor)
     try:
         yield driver
@@ -297,10 +287,10 @@ def _camera(bench: CameraBench) -> Iterator[GuardedCamera]:
         yield camera
 
 
-def _retake(camera: GuardedCamera) -> Frame:
+def _retake(camera: GuardedCamera) -> roles.Frame:
     camera.expose()
     return camera.fetch()
 
 
-def _require_picture(frame: Frame, scene: Pixels, what: str) -> None:
+def _require_picture(frame: roles.Frame, scene: roles.Pixels, what: str) -> None:
     require(np.array_equal(frame.pixels, scene), f"{what} is not what the sensor saw")

@@ -10,20 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from firmware_iface import roles
 from firmware_iface.driver_calls import call_driver, close_driver
-from firmware_iface.roles import (
-    TRIES,
-    Camera,
-    Clock,
-    DeviceIdentity,
-    ExposingCamera,
-    Frame,
-    FrameLostError,
-    LinkError,
-    OpticalDevice,
-    Pixels,
-    SensorFormat,
-)
 
 # A camera's clock, converted to the run's clock, may be off by this; a frame of an earlier trigger is older
 _CLOCK_TOLERANCE_S = 0.005
@@ -35,24 +23,24 @@ class GuardedCamera:
     Raises ValueError if the driver is no camera.
     """
 
-    def __init__(self, driver: OpticalDevice, sensor: SensorFormat, now: Clock, name: str) -> None:
-        self._overlaps = isinstance(driver, ExposingCamera)
-        if not self._overlaps and not isinstance(driver, Camera):
+    def __init__(self, driver: roles.OpticalDevice, sensor: roles.SensorFormat, now: roles.Clock, name: str) -> None:
+        self._overlaps = isinstance(driver, roles.ExposingCamera)
+        if not self._overlaps and not isinstance(driver, roles.Camera):
             raise ValueError(f"{name}: the driver has neither grab nor expose and fetch, so it is no camera")
         self.driver, self._sensor, self._now, self._name = driver, sensor, now, name
         self._opened = False
         self._triggered_s = math.nan
-        self._grabbed: Frame | FrameLostError | None = None
+        self._grabbed: roles.Frame | roles.FrameLostError | None = None
 
-    def open(self) -> DeviceIdentity:
+    def open(self) -> roles.DeviceIdentity:
         """Connect and apply the settings. Raises LinkError."""
         if self._opened:
             self.close()
-        identity: DeviceIdentity = self._call("open", returns=DeviceIdentity)
+        identity: roles.DeviceIdentity = self._call("open", returns=roles.DeviceIdentity)
         self._opened = True
         return identity
 
-    def expose(self, out: Pixels | None = None) -> None:
+    def expose(self, out: roles.Pixels | None = None) -> None:
         """Trigger, and return when the exposure is over. Raises LinkError."""
         if not self._opened:
             self.open()
@@ -61,31 +49,31 @@ class GuardedCamera:
             self._call("expose", out)
             return
         try:
-            self._grabbed = self._call("grab", out, returns=Frame)
-        except FrameLostError as error:
+            self._grabbed = self._call("grab", out, returns=roles.Frame)
+        except roles.FrameLostError as error:
             self._grabbed = error
 
-    def fetch(self) -> Frame:
+    def fetch(self) -> roles.Frame:
         """The frame of the last `expose`. Raises FrameLostError (expose again), LinkError."""
         if math.isnan(self._triggered_s):
-            raise LinkError(f"{self._name}: no exposure to fetch")
+            raise roles.LinkError(f"{self._name}: no exposure to fetch")
         triggered_s, self._triggered_s = self._triggered_s, math.nan
         found, self._grabbed = self._grabbed, None
         if self._overlaps:
-            found = self._call("fetch", returns=Frame)
-        if isinstance(found, FrameLostError):
+            found = self._call("fetch", returns=roles.Frame)
+        if isinstance(found, roles.FrameLostError):
             raise found
         assert found is not None
         self._check(found, triggered_s)
         return found
 
-    def grab(self, out: Pixels | None = None) -> Frame:
+    def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
         """One exposure, taken again when it is lost. Raises LinkError (no camera, or three frames lost in a row)."""
-        for _ in range(TRIES - 1):
+        for _ in range(roles.TRIES - 1):
             try:
                 self.expose(out)
                 return self.fetch()
-            except FrameLostError:
+            except roles.FrameLostError:
                 continue
         self.expose(out)
         return self.fetch()
@@ -103,24 +91,24 @@ class GuardedCamera:
     def _call(self, method: str, *arguments: object, returns: type[object] = object) -> Any:
         try:
             return call_driver(self._name, self.driver, method, *arguments, returns=returns)
-        except FrameLostError:
+        except roles.FrameLostError:
             raise
-        except LinkError:
+        except roles.LinkError:
             self.close()
             raise
 
-    def _check(self, frame: Frame, triggered_s: float) -> None:
+    def _check(self, frame: roles.Frame, triggered_s: float) -> None:
         """Refuse a frame of another size or type, and one that was not exposed after its trigger."""
         pixels, sensor = frame.pixels, self._sensor
         if not isinstance(pixels, np.ndarray) or pixels.shape != sensor.shape or pixels.dtype != sensor.dtype:
             self.close()
-            raise LinkError(
+            raise roles.LinkError(
                 f"{self._name}: gave {_describe_array(pixels)}, [optics.camera] states {sensor.width_px} x "
                 f"{sensor.height_px} {sensor.dtype}"
             )
         earliest_s, latest_s = triggered_s - _CLOCK_TOLERANCE_S, self._now() + _CLOCK_TOLERANCE_S
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
-            raise FrameLostError(
+            raise roles.FrameLostError(
                 f"{self._name}: gave a frame of {frame.time_s} s for the trigger at {triggered_s:.3f} s: late, or "
                 "its time is not on the run's clock"
             )

@@ -61,10 +61,6 @@ _STEP = "Readings farther than this from both previous ones are rejected. Raise 
 StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
-_NAME = "Name under which the driver is installed. Set it to one that `devices` lists."
-DriverName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", description=_NAME)]
-
-
 class Optoncdt1420Config(Section):
     """Micro-Epsilon optoNCDT 1420 laser."""
 
@@ -223,7 +219,8 @@ class ExternalSection(Section):
     model_config = ConfigDict(extra="allow")
 
     driver: Literal["external"]
-    name: DriverName
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    """Name under which the driver is installed. Set it to one that `devices` lists."""
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -255,28 +252,19 @@ ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the othe
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
 
 
-_INTERLOCK_NAME = "Name in messages. Set it to a word of lower-case letters, digits and `_`, such as door."
-_INTERLOCK_TEXT = "For people, while the circuit is open. Set it to what is open and what to do."
-_INTERLOCK_LEVEL = (
-    "Safe level that an open circuit, or a lost signal, enters. Set it to vent where pressure in the mirror is the "
-    "danger, to ramp_down where a sudden stop is."
-)
-_PERIOD = "Interval between requests. Lower it for a contact that may open for a moment only."
-_AGE_MAX = "Age from which an answer no longer counts: the circuit is then open. Raise it for a slow line."
-InterlockName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$", description=_INTERLOCK_NAME)]
-InterlockText = Annotated[str, Field(min_length=1, max_length=200, description=_INTERLOCK_TEXT)]
-InterlockLevel = Annotated[Literal["ramp_down", "pump_off", "vent"], Field(description=_INTERLOCK_LEVEL)]
-PollPeriod = Annotated[float, Field(ge=0.01, le=10, description=_PERIOD)]
-PollAgeMax = Annotated[float, Field(ge=0.05, le=30, description=_AGE_MAX)]
 BOARD_INPUTS = 16
 
 
 class InterlockConfig(Section):
     """A normally closed circuit that prevents a hold, and ends one, while it is open."""
 
-    name: InterlockName
-    text: InterlockText
-    safe_level: InterlockLevel = "pump_off"
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
+    """Name in messages. Set it to a word of lower-case letters, digits and `_`, such as door."""
+    text: Annotated[str, Field(min_length=1, max_length=200)]
+    """For people, while the circuit is open. Set it to what is open and what to do."""
+    safe_level: Literal["ramp_down", "pump_off", "vent"] = "pump_off"
+    """Safe level that an open circuit, or a lost signal, enters. Set it to vent where pressure in the mirror is the
+    danger, to ramp_down where a sudden stop is."""
 
     @model_validator(mode="after")
     def _one_line_of_text(self) -> "InterlockConfig":
@@ -296,8 +284,10 @@ class BoardInputConfig(InterlockConfig):
 class PolledInterlockConfig(InterlockConfig):
     """Interlock at a device that is asked again and again."""
 
-    period_s: PollPeriod = 0.1
-    age_max_s: PollAgeMax = 0.5
+    period_s: Annotated[float, Field(ge=0.01, le=10)] = 0.1
+    """Interval between requests. Lower it for a contact that may open for a moment only."""
+    age_max_s: Annotated[float, Field(ge=0.05, le=30)] = 0.5
+    """Age from which an answer no longer counts: the circuit is then open. Raise it for a slow line."""
 
 
 class ModbusInputConfig(PolledInterlockConfig):

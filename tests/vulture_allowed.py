@@ -12,7 +12,8 @@ _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by t
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`
 list_checks  # of the conformance tests: called by the tests of drivers' packages
 Camera  # the role that the camera drivers fill
-AravisCamera, FolderCamera, PygameDisplay, UvcCamera  # named as text in firmware_iface/drivers/__init__.py
+AravisCamera, FolderCamera, UvcCamera, PygameDisplay, KeyenceDlRs1a, Mks937b, Optoncdt1420, VaisalaPtb330, Ventus
+# those are named as text in firmware_iface/drivers/__init__.py
 _.common_covariance_um2, _.screen_points, gradients, _.experiments  # a library: docs/metrology.md, tuning.md
 _.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result
 _.trace_pixels, _.on_film, _.back_sag_mm, _.pump_um_per_s  # the twin's truth, which tests compare with

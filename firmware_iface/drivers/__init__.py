@@ -1,9 +1,9 @@
 """Drivers of devices, each of which fills a role of `roles.py`; and those of other packages.
 
 A package names its driver in the entry point group of its kind, and an emulator of the device in the group of its
-emulators (docs/new-device.md). The drivers of cameras and screens in this package are entry points as well, listed
-below. Only an installed package is ever executed, and only when a configuration names it: no configuration, run
-folder or working folder can name a file.
+emulators (docs/new-device.md). The drivers of this package that are made from their settings alone, and those of
+cameras and screens, are entry points as well, listed below. Only an installed package is ever executed, and only when
+a configuration names it: no configuration, run folder or working folder can name a file.
 """
 
 from dataclasses import dataclass
@@ -20,27 +20,45 @@ class DriverKind:
     name: str
     group: str
     emulators: str
-    built_in: tuple[tuple[str, str], ...] = ()  # name and object of an entry point
+    built_in: dict[str, str]  # name and object of an entry point
 
 
-SENSORS = DriverKind("driver", "membrane_ctrl.drivers", "membrane_ctrl.emulators")
+SENSORS = DriverKind(
+    "driver",
+    "membrane_ctrl.drivers",
+    "membrane_ctrl.emulators",
+    {
+        "keyence_dl_rs1a": "firmware_iface.drivers.keyence_dl_rs1a:KeyenceDlRs1a",
+        "mks_937b": "firmware_iface.drivers.mks_937b:Mks937b",
+        "optoncdt1420": "firmware_iface.drivers.optoncdt1420:Optoncdt1420",
+        "vaisala_ptb330": "firmware_iface.drivers.vaisala_ptb330:VaisalaPtb330",
+        "ventus": "firmware_iface.drivers.ventus:Ventus",
+    },
+)
 CAMERAS = DriverKind(
     "camera driver",
     "membrane_ctrl.cameras",
     "membrane_ctrl.camera_emulators",
-    (
-        ("aravis", "firmware_iface.drivers.camera_aravis:AravisCamera"),
-        ("folder", "firmware_iface.drivers.camera_opencv:FolderCamera"),
-        ("uvc", "firmware_iface.drivers.camera_opencv:UvcCamera"),
-    ),
+    {
+        "aravis": "firmware_iface.drivers.camera_aravis:AravisCamera",
+        "folder": "firmware_iface.drivers.camera_opencv:FolderCamera",
+        "uvc": "firmware_iface.drivers.camera_opencv:UvcCamera",
+    },
 )
 SCREENS = DriverKind(
     "screen driver",
     "membrane_ctrl.screens",
     "membrane_ctrl.screen_emulators",
-    (("pygame", "firmware_iface.drivers.screen_pygame:PygameDisplay"),),
+    {"pygame": "firmware_iface.drivers.screen_pygame:PygameDisplay"},
 )
 KINDS = (SENSORS, CAMERAS, SCREENS)
+
+
+def load_built_in(name: str, kind: DriverKind) -> Any:
+    """Import the driver class of this name in this package; no other package can take its place."""
+    from importlib.metadata import EntryPoint
+
+    return EntryPoint(name, kind.built_in[name], kind.group).load()
 
 
 def list_installed(group: str) -> list["EntryPoint"]:
@@ -51,11 +69,11 @@ def list_installed(group: str) -> list["EntryPoint"]:
 
 
 def load_driver(name: str, kind: DriverKind) -> Any:
-    """Import the driver class of this name. Raises ValueError if none or several exist, or if it cannot be loaded."""
-    from importlib.metadata import EntryPoint
+    """Import the driver class that another package installs under this name.
 
-    built_in = [EntryPoint(name, value, kind.group) for name, value in kind.built_in]
-    return _load(name, kind.name, built_in + list_installed(kind.group))
+    Raises ValueError if none or several do, or if it cannot be loaded.
+    """
+    return _load(name, kind.name, list_installed(kind.group))
 
 
 def load_emulator(name: str, kind: DriverKind) -> Any:
@@ -74,7 +92,7 @@ def _load(name: str, what: str, entries: list["EntryPoint"]) -> Any:
         known = ", ".join(entry.name for entry in entries) or "none"
         raise ValueError(f"no {what} {name!r} is installed; installed: {known} (docs/new-device.md)")
     if len(found) > 1:
-        packages = " and ".join(entry.dist.name if entry.dist else "membrane-ctrl" for entry in found)
+        packages = " and ".join(entry.dist.name if entry.dist else entry.value for entry in found)
         raise ValueError(f"{packages} both install a {what} {name!r}; uninstall one")
     try:
         return found[0].load()

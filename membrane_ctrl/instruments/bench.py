@@ -13,12 +13,7 @@ from typing import Any, TypeVar
 
 from firmware_iface import drivers, interlocks, role_bench, roles, settings
 from firmware_iface.drivers import bronkhorst, bronkhorst_propar, modbus_map
-from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
-from firmware_iface.drivers.mks_937b import Mks937b
-from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
-from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.links import modbus_rtu, serial_port
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.schema import DevicesConfig
@@ -30,13 +25,6 @@ from membrane_ctrl.model.terminal import one_line
 
 
 ACTUATORS = ("pump", "vent")
-_SERIAL_DRIVERS: dict[type[settings.Section], Callable[[Any], roles.Device]] = {
-    settings.Optoncdt1420Config: Optoncdt1420,
-    settings.KeyenceDlRs1aConfig: KeyenceDlRs1a,
-    settings.VaisalaPtb330Config: VaisalaPtb330,
-    settings.VentusConfig: Ventus,
-    settings.Mks937bConfig: Mks937b,
-}
 
 
 def role_devices(devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None) -> role_bench.RoleDevices:
@@ -66,13 +54,12 @@ def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLink
             return _bronkhorst(
                 role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
             )
-        case settings.ExternalConfig():
+        case _:
             device = driver_loading.make_driver(section, f"devices.{role}", drivers.SENSORS)
             if not hasattr(device, roles.READS[role][0]):
-                raise ValueError(f"the driver {section.name} has no {roles.READS[role][0]}, so it is no {role}")
+                name = driver_loading.name_of(section)
+                raise ValueError(f"the driver {name} has no {roles.READS[role][0]}, so it is no {role}")
             return device
-        case _:
-            return _SERIAL_DRIVERS[type(section)](section)
 
 
 def _bronkhorst(

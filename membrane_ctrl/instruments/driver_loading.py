@@ -59,8 +59,10 @@ def make_emulator(section: settings.ExternalSection, where: str, kind: drivers.D
 
 
 def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
+    if not isinstance(section, settings.ExternalSection):
+        return drivers.load_built_in(section.driver, kind)
     try:
-        return drivers.load_driver(name_of(section), kind)
+        return drivers.load_driver(section.name, kind)
     except ValueError as error:
         raise InputError(f"{where}: {error}") from error
 
@@ -68,5 +70,7 @@ def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
 def _construct(make: Any, checked: settings.Section, where: str, more: tuple[Any, ...]) -> Any:
     try:
         return make(checked, *more)
+    except ValueError as error:  # a setting that it refuses
+        raise InputError(f"{where}: {error}") from error
     except (Exception, SystemExit) as error:  # whatever its code does
         raise InputError(f"{where}: {make.__name__} cannot be made: {type(error).__name__}: {error}") from error

@@ -169,13 +169,6 @@ def test_camera_with_pixels_of_its_own_is_copied(bench: Bench) -> None:
     assert bench.reconstructor.calls[0].levels == list(range(18))
 
 
-def test_frames_of_another_size_than_configured_are_refused(bench: Bench) -> None:
-    bench.camera.own_pixels = np.zeros((HEIGHT_PX, WIDTH_PX + 1), np.uint8)
-    failure = bench.failed()
-    assert failure.stage == "camera"
-    assert "camera gave 7 x 4 uint8, the configuration states 6 x 4 uint8" in failure.message
-
-
 def test_stopped_cycle_has_no_result_and_is_taken_again(bench: Bench) -> None:
     bench.exposures_left = 5
     assert bench.cycle.take() is None

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from acquisition_fakes import VirtualClock
 
+from firmware_iface.drivers.camera_opencv import FolderCamera
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from membrane_ctrl.acquisition import driver_check, optical_bench
@@ -167,9 +168,9 @@ def refusal(config: Config) -> str:
         ({"exposure": 5}, {}, "devices.camera: exposure: unknown key; did you mean exposure_ms?"),
         ({"exposure_ms": 2000.0}, {}, "exposure_ms: input should be less than or equal to 1000"),
         ({}, {"bright": 1}, "devices.screen: bright: 1: write true or false"),
-        ({"name": "studio_com"}, {}, "no camera driver 'studio_com' is installed; installed: aravis, folder, uvc, s"),
+        ({"name": "studio_com"}, {}, "no camera driver 'studio_com' is installed; installed: studio_cam"),
         ({"name": "studio_wall"}, {}, "no camera driver 'studio_wall' is installed"),
-        ({}, {"name": "studio_cam"}, "no screen driver 'studio_cam' is installed; installed: pygame, studio_wall"),
+        ({}, {"name": "studio_cam"}, "no screen driver 'studio_cam' is installed; installed: studio_wall"),
     ],
     ids=["key", "range", "screen", "name", "screen as camera", "camera as screen"],
 )
@@ -230,10 +231,10 @@ def test_a_driver_that_cannot_be_made_is_refused(site: Path) -> None:
 
 def test_a_package_cannot_replace_a_built_in_driver(site: Path) -> None:
     entries = site / "studio_optics-2.1.dist-info" / "entry_points.txt"
-    entries.write_text(entries.read_text().replace("studio_wall = studio_optics:StudioWall", "pygame = os:system"))
-    config = configured()
-    tables = config.model_dump(mode="json", exclude_none=True)
-    tables["devices"]["screen"] = {"driver": "pygame", **SCREEN}
-    tables["devices"]["camera"] = {"driver": "aravis"}
-    with pytest.raises(InputError, match="membrane-ctrl and studio-optics both install a screen driver 'pygame'"):
-        make(Config.model_validate(tables))()
+    entries.write_text(entries.read_text().replace("studio_cam = studio_optics:S", "folder = studio_optics:S"))
+    tables = configured().model_dump(mode="json", exclude_none=True)
+    del tables["devices"]["screen"]
+    tables["devices"]["camera"] = {"driver": "folder", "folder": str(site)}
+    bench = optical_bench.configured_bench(Config.model_validate(tables), VirtualClock())
+    assert isinstance(bench.screen, FolderCamera)
+    assert "studio_optics" not in sys.modules
