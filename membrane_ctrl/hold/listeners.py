@@ -164,7 +164,7 @@ class SystemdNotify:
             return
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
         self._next_s, self._state = row.mono_s + _NOTIFY_S, row.state
-        error = f", error {row.error_um:+.2f} um" if math.isfinite(row.error_um) else ""
+        error = f", {row.labelled('error_um', sign=True)}" if math.isfinite(row.error_um) else ""
         fault = f", fault {row.fault:g}" if row.fault else ""
         locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
         problems = self._status.recording_problems

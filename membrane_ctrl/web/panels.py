@@ -18,6 +18,7 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
+from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import sparkline
 from membrane_ctrl.run_files.run import open_run
@@ -62,7 +63,7 @@ def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
 
 def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
     """The table of all holds; a click on a name opens its page."""
-    labels = {"hold": "mirror", "state": "state", "error": "error, um", "says": "alarms, or why"}
+    labels = {"hold": "mirror", "state": "state", "error": COLUMNS["error_um"].title, "says": "alarms, or why"}
     columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in labels.items()]
     table = ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold").classes("w-full").props("dense")
     link = '<a class="underline" :href="\'?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'

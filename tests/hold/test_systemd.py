@@ -56,7 +56,7 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd:
     assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=check"]
     assert messages[1:5] == [["WATCHDOG=1", "STATUS=check"]] * 4
     assert messages[5:] == [
-        ["WATCHDOG=1", "STATUS=hold, error -0.42 um"],
+        ["WATCHDOG=1", "STATUS=hold, error -0.42 µm"],
         ["WATCHDOG=1", "STATUS=fault, fault 20"],
         ["STOPPING=1"],
     ]

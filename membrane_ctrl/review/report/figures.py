@@ -134,7 +134,7 @@ def overview(analysis: Analysis) -> str:
         if np.isfinite(level["mean_true_error_um"]).any():
             plot.plot(time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)")
         plot.set_ylim(-3 * band_um, 3 * band_um)
-        plot.set(ylabel="setpoint − centre, µm", title="The run at a glance")
+        plot.set(ylabel=plot_title(ERROR), title="The run at a glance")
         _found(plot, analysis, span_s)
         plot.legend(loc="upper right", ncols=3)
         _lane(lane, analysis, span_s)

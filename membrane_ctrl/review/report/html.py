@@ -153,7 +153,7 @@ def _details(analysis: Analysis) -> str:
         (f"drift, {name}", _slope(series.drift, "µm/h")),
         ("not counted as held", ", ".join(beside(ticks.faults_s, ticks.paused_s, ticks.moving_s,
                                                   ticks.end_s - ticks.start_s)) or "nothing"),
-        ("single laser readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
+        ("single readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
         (f"RMS by frequency, {name}", _bands(series)),
     ])  # fmt: skip
 

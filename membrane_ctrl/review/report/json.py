@@ -37,7 +37,7 @@ def verdict(analysis: Analysis) -> tuple[Word, str]:
     if series is None or not series.windows[0].count:
         return "bad", f"Not held: no second of {whole} counts as settled{_what(names)}."
     seconds = series.windows[0]
-    who = "true centre" if analysis.true else "laser reading"
+    who = "true centre" if analysis.true else "reading"
     std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
     share = 100 * seconds.in_band
     parts = []
