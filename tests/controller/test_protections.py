@@ -27,6 +27,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
+from tests.support.copied_bench import Originals
 
 RATE_HZ = 10.0
 Spoil = Callable[[float, ShapeEstimate], ShapeEstimate | None]  # seconds since the failure, the figure
@@ -47,13 +48,17 @@ def config_of(process_value: str, **tables: object) -> Config:
     )
 
 
+def unspoiled(since_s: float, figure: ShapeEstimate) -> ShapeEstimate:
+    return figure
+
+
 @dataclass
 class Bench:
     """A held mirror of which one sensor will fail."""
 
     config: Config
-    spoil: Spoil = lambda since_s, figure: figure
-    settle_s: float = 45.0
+    settle_s: float
+    spoil: Spoil = unspoiled
 
     def __post_init__(self) -> None:
         self.bench = VirtualBench(Plant(self.config.twin, self.config.pump))
@@ -124,6 +129,16 @@ class Bench:
         return [event.name for event in self.told(Maintenance)]  # type: ignore[attr-defined]
 
 
+_SETTLED = Originals[Bench]()
+
+
+def settled(config: Config, spoil: Spoil = unspoiled, settle_s: float = 45.0) -> Bench:
+    """A mirror that has been held for this long."""
+    bench = _SETTLED.copy_of((config.model_dump_json(), settle_s), lambda: Bench(config, settle_s))
+    bench.spoil = spoil
+    return bench
+
+
 def lose_laser(wrong: Wrong, since_s: float) -> None:
     wrong.no_light = True
 
@@ -151,7 +166,7 @@ def frozen() -> Spoil:
 @pytest.mark.parametrize("lose", [lose_laser, stick_laser], ids=["lost", "stuck"])
 @pytest.mark.parametrize("flow_um_per_s", [5.0, 0.0])
 def test_manual_flow_stays_within_its_range_when_the_laser_fails(lose: Fail, flow_um_per_s: float) -> None:
-    held = Bench(config_of("estimate"))
+    held = settled(config_of("estimate"))
     held.command(Command("manual", "a test", value=flow_um_per_s))
     held.fail(60.0, lose)
     assert held.moved_um < MANUAL_RANGE_UM + 10.0
@@ -161,7 +176,7 @@ def test_manual_flow_stays_within_its_range_when_the_laser_fails(lose: Fail, flo
 
 @pytest.mark.parametrize("process_value", ["estimate", "optics"])
 def test_manual_flow_with_frozen_figures_is_stopped_by_the_gauge(process_value: str) -> None:
-    held = Bench(config_of(process_value), frozen())
+    held = settled(config_of(process_value), frozen())
     held.command(Command("manual", "a test", value=5.0))
     held.fail(60.0, lose_laser)
     assert held.faults == ["laser_gauge_apart"]
@@ -170,7 +185,7 @@ def test_manual_flow_with_frozen_figures_is_stopped_by_the_gauge(process_value: 
 
 def test_the_displacement_limit_holds_by_the_optics_when_the_laser_is_lost() -> None:
     limits = LimitsConfig(displacement_max_um=30.0)
-    held = Bench(config_of("estimate", limits=limits))
+    held = settled(config_of("estimate", limits=limits))
     held.command(Command("manual", "a test", value=5.0))
     held.fail(40.0, lose_laser)
     assert held.faults == ["over_displacement"]
@@ -179,7 +194,7 @@ def test_the_displacement_limit_holds_by_the_optics_when_the_laser_is_lost() -> 
 
 @pytest.mark.parametrize("um_per_s", [-5.0, -1.0, -0.5, 1.0])
 def test_drifting_optics_that_hold_without_a_laser_are_stopped_by_the_gauge(um_per_s: float) -> None:
-    held = Bench(config_of("estimate"), drifting(um_per_s)).fail(200.0, lose_laser)
+    held = settled(config_of("estimate"), drifting(um_per_s)).fail(200.0, lose_laser)
     assert held.faults == ["laser_gauge_apart"]
     assert held.moved_um < 65.0
     assert held.notices[0] == "laser_lost"
@@ -190,7 +205,7 @@ def test_the_loss_of_the_laser_is_reported_at_once_and_its_return_too() -> None:
     def lose(wrong: Wrong, since_s: float) -> None:
         wrong.no_light = 5.0 < since_s < 20.0
 
-    held = Bench(config_of("estimate")).fail(40.0, lose)
+    held = settled(config_of("estimate")).fail(40.0, lose)
     times_s = [
         t.row.mono_s - held.ticks[0].row.mono_s for t in held.ticks for e in t.events if isinstance(e, Maintenance)
     ]
@@ -206,13 +221,13 @@ def test_a_laser_that_blinks_is_not_reported() -> None:
     def blink(wrong: Wrong, since_s: float) -> None:
         wrong.no_light = since_s % 10.0 < 1.0
 
-    assert Bench(config_of("estimate")).fail(40.0, blink).notices == []
+    assert settled(config_of("estimate")).fail(40.0, blink).notices == []
 
 
 @pytest.mark.parametrize("process_value", ["laser", "estimate", "optics"])
 def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) -> None:
     """The weather moves the film after the pause; what the loop follows shows nothing of it."""
-    held = Bench(config_of(process_value, states=StatesConfig(pause_max_s=20.0)), frozen())
+    held = settled(config_of(process_value, states=StatesConfig(pause_max_s=20.0)), frozen())
     held.command(Command("pause", "a test"))
 
     def fail(wrong: Wrong, since_s: float) -> None:
@@ -241,7 +256,7 @@ def test_a_pause_with_frozen_sensors_ends_in_the_safe_state(process_value: str) 
 )
 @pytest.mark.parametrize("process_value", ["estimate", "optics"])
 def test_a_figure_that_cannot_be_used_counts_as_missing(spoil: Spoil, process_value: str) -> None:
-    held = Bench(config_of(process_value), spoil).fail(40.0, lose_laser)
+    held = settled(config_of(process_value), spoil).fail(40.0, lose_laser)
     first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
     assert held.faults[0] == first
     assert held.moved_um < 10.0
@@ -250,7 +265,7 @@ def test_a_figure_that_cannot_be_used_counts_as_missing(spoil: Spoil, process_va
 
 @pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
 def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float) -> None:
-    held = Bench(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
+    held = settled(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
     assert [event.liar for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
     assert held.moved_um < 40.0
     assert held.faults == []
@@ -259,13 +274,13 @@ def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float
 
 def test_laser_and_optics_may_drift_apart_no_further_than_the_trim() -> None:
     shape = ShapeConfig(mode="track", track_rate_hz=RATE_HZ, trim_max_um=10.0)
-    held = Bench(config_of("estimate", shape=shape), drifting(0.03)).fail(700.0)
+    held = settled(config_of("estimate", shape=shape), drifting(0.03)).fail(700.0)
     assert "trim_limit" in held.notices
     assert held.moved_um < 14.0
 
 
 def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> None:
-    held = Bench(config_of("estimate"))
+    held = settled(config_of("estimate"))
     spec = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
     held.command(Command("tune", "a test", experiment=spec))
     held.fail(20.0, lose_laser)
@@ -277,18 +292,17 @@ def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> No
 
 def test_gas_that_the_film_takes_is_judged_while_only_the_optics_show_it_standing() -> None:
     limits = LimitsConfig(laser_gauge_apart_max_um=400.0)
-    held = Bench(config_of("estimate", limits=limits), frozen(), settle_s=130.0)
 
     def fail(wrong: Wrong, since_s: float) -> None:
         wrong.no_light = True
         wrong.vent_stuck_fraction = 0.02  # the film takes 2 um/s more
 
-    held = Bench(config_of("estimate", limits=limits), settle_s=130.0).fail(150.0, fail)
+    held = settled(config_of("estimate", limits=limits), settle_s=130.0).fail(150.0, fail)
     assert held.faults == ["gas_excess"]
 
 
 def test_a_hold_inflates_again_by_the_optics_after_manual_flow() -> None:
-    held = Bench(config_of("estimate"))
+    held = settled(config_of("estimate"))
     held.command(Command("manual", "a test", value=0.0))
     held.fail(20.0, lose_laser)
     held.command(Command("hold", "a test"))
@@ -317,7 +331,7 @@ UNDERTAKINGS = {
 @pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
 def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoil: Spoil) -> None:
     """Laser and gauge are sound; without a comparison while the film moves the loop follows the optics."""
-    held = Bench(config_of("estimate"), spoil)
+    held = settled(config_of("estimate"), spoil)
     held.command(UNDERTAKINGS[undertaking])
     held.fail(90.0)
     assert "optics" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
@@ -330,7 +344,7 @@ def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoi
 
 @pytest.mark.parametrize("process_value", ["laser", "estimate"])
 def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
-    held = Bench(config_of(process_value))
+    held = settled(config_of(process_value))
     held.command(UNDERTAKINGS["tune"])
 
     def drift(wrong: Wrong, since_s: float) -> None:
@@ -342,7 +356,7 @@ def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
 
 
 def test_figures_of_another_mirror_count_as_missing() -> None:
-    held = Bench(config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)).fail(20.0)
+    held = settled(config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)).fail(20.0)
     assert held.notices == ["optics_lost"]
     assert held.moved_um < 2.0
 
@@ -353,7 +367,7 @@ def test_figures_of_another_mirror_count_as_missing() -> None:
 def test_sound_sensors_contradict_each_other_nowhere(
     undertaking: str, shape: ShapeConfig, process_value: str
 ) -> None:
-    held = Bench(config_of(process_value, shape=shape))
+    held = settled(config_of(process_value, shape=shape))
     held.command(UNDERTAKINGS[undertaking])
     held.fail(80.0)
     assert held.told(Plausibility) == []
@@ -380,7 +394,7 @@ def outlying(um: float, one_in: int) -> Spoil:
 @pytest.mark.parametrize("spoil", [alternating(10.0, 2.0), outlying(15.0, 6)], ids=["alternating", "1 in 6"])
 def test_optics_that_jump_again_and_again_are_left_out(spoil: Spoil) -> None:
     """Each step looks like a knock of the laser; together they led the mirror by hundreds of micrometres."""
-    held = Bench(config_of("estimate"), spoil).fail(150.0)
+    held = settled(config_of("estimate"), spoil).fail(150.0)
     assert "optics_unsteady" in held.notices
     assert held.moved_um < 30.0
     assert held.faults == []
@@ -390,7 +404,7 @@ def test_a_laser_that_is_knocked_again_and_again_does_not_lead_the_film() -> Non
     def knock(wrong: Wrong, since_s: float) -> None:
         wrong.laser_offset_um = 45.0 if since_s % 20.0 < 10.0 else 0.0
 
-    held = Bench(config_of("estimate")).fail(300.0, knock)
+    held = settled(config_of("estimate")).fail(300.0, knock)
     assert held.moved_um < 20.0
     assert "laser" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
 
@@ -402,7 +416,7 @@ def leak_more(wrong: Wrong, since_s: float) -> None:
 
 def test_optics_that_the_estimate_does_not_use_replace_no_laser() -> None:
     """With the shape loop off the loop would follow a dead reckoning, and only the optics would be judged."""
-    held = Bench(config_of("estimate"))
+    held = settled(config_of("estimate"))
     held.command(Command("shape_off", "a test"))
     held.fail(60.0, leak_more)
     assert held.faults[0] == "displacement_missing"
@@ -415,7 +429,7 @@ def test_optics_that_were_outvoted_replace_no_laser() -> None:
         if since_s > 60.0:
             leak_more(wrong, since_s)
 
-    held = Bench(config_of("estimate"), stepping(18.0)).fail(120.0, fail)
+    held = settled(config_of("estimate"), stepping(18.0)).fail(120.0, fail)
     assert held.faults[0] == "displacement_missing"
     assert held.moved_um < 30.0
 
@@ -428,13 +442,13 @@ def test_a_laser_that_answers_now_and_then_counts_as_missing() -> None:
         ticks += 1
         wrong.no_light = ticks % 19 != 0
 
-    held = Bench(config_of("estimate"), drifting(-5.0)).fail(70.0, seldom)
+    held = settled(config_of("estimate"), drifting(-5.0)).fail(70.0, seldom)
     assert held.moved_um < 100.0
     assert held.state == State.FAULT
 
 
 def test_a_figure_that_the_shape_loop_cannot_use_is_a_fault_and_no_exception() -> None:
-    held = Bench(config_of("estimate"), lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5])).fail(
-        5.0
-    )
+    held = settled(
+        config_of("estimate"), lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5])
+    ).fail(5.0)
     assert held.faults == ["tick_error"]
