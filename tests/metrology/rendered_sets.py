@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,25 +55,39 @@ def good_set(
     seed: int = 1,
 ) -> FrameStack:
     """A full set; with `motion_um` of the time the film moves and the laser says so."""
-    renderer = OpticsRenderer(optics, film, light or Light(), seed=seed)
     shown = patterns(optics, shifts_rad)
-    readings = np.array([0.0 if motion_um is None else motion_um(0.1 * k) for k in range(len(shown))])
-    frames = np.stack([renderer.render(p, float(d)) for p, d in zip(shown, readings, strict=True)])
-    return stack_of(frames, shown, None if motion_um is None else readings)
+    readings = tuple(0.0 if motion_um is None else float(motion_um(0.1 * k)) for k in range(len(shown)))
+    frames = _frames(optics, film, light or Light(), shifts_rad, seed, readings).copy()
+    return stack_of(frames, shown, None if motion_um is None else np.array(readings))
+
+
+@lru_cache(maxsize=32)
+def _frames(
+    optics: OpticsConfig,
+    film: FilmShape,
+    light: Light,
+    shifts_rad: tuple[float, ...],
+    seed: int,
+    readings_um: tuple[float, ...],
+) -> NDArray[np.uint8]:
+    renderer = OpticsRenderer(optics, film, light, seed=seed)
+    shown = patterns(optics, shifts_rad)
+    return np.stack([renderer.render(p, d) for p, d in zip(shown, readings_um, strict=True)])
 
 
 def faulty_set(kind: str, frame: str, steps: int = 4, gamma: float = 1.0) -> FrameStack:
     """A full set in which one frame went wrong."""
-    renderer, shown = _renderer(steps, gamma), patterns(bench(steps))
+    stack = good_set(bench(steps), light=Light(gamma=gamma))
+    renderer, shown, frames = _renderer(steps, gamma), stack.patterns, stack.frames
     place = [p.name for p in shown].index(frame)
-    content = list(shown)
-    if kind == "stale":
-        content[place] = shown[place - 1]
-    elif kind == "swapped":
-        content[place], content[place + 1] = shown[place + 1], shown[place]
-    moved = {place: 200.0} if kind == "moved" else {}
-    gain = {place: GAINS[kind]} if kind in GAINS else {}
-    frames = np.stack([renderer.render(p, moved.get(k, 0.0), gain=gain.get(k, 1.0)) for k, p in enumerate(content)])
     if kind == "repeated":
         frames[place] = frames[place - 1]
-    return stack_of(frames, shown)
+    elif kind == "stale":
+        frames[place] = renderer.render(shown[place - 1], 0.0)
+    elif kind == "swapped":
+        frames[[place, place + 1]] = frames[[place + 1, place]]
+    elif kind == "moved":
+        frames[place] = renderer.render(shown[place], 200.0)
+    else:
+        frames[place] = renderer.render(shown[place], 0.0, gain=GAINS[kind])
+    return stack
