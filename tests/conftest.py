@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import inspect
+import itertools
 import multiprocessing
 import os
 import shutil
 import signal
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Generator, Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -20,6 +23,7 @@ from tests.support.undrawn import undrawn_figures
 
 # No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture starts.
 _LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
+_NUMBERS = itertools.count()
 os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 settings.register_profile("seeded", derandomize=True, deadline=None)
@@ -28,6 +32,16 @@ settings.load_profile("seeded")
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], SteadyLoop]]:
     return {"steady": SteadyLoop}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported and collected stays to the end: the collector of garbage need not look at it."""
+    gc.disable()
+    collected = yield
+    gc.freeze()
+    gc.enable()
+    return collected
 
 
 def pytest_sessionfinish() -> None:
@@ -61,9 +75,13 @@ def undrawn() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def own_locks(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+def own_locks() -> Iterator[None]:
     """The locks of a test are its own."""
-    monkeypatch.setenv(lock_store.VARIABLE, str(tmp_path_factory.mktemp("locks")))
+    folder = Path(_LOCKS_FOLDER, str(next(_NUMBERS)))  # mktemp would list the folders of all tests before
+    folder.mkdir()
+    os.environ[lock_store.VARIABLE] = str(folder)
+    yield
+    os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 
 @pytest.fixture(autouse=True)
