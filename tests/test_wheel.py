@@ -12,7 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from membrane_ctrl import __version__
+
 ROOT = Path(__file__).parents[1]
+COMMIT = "0123456789ab" + 28 * "c"
 PACKAGES = ("membrane_ctrl", "firmware_iface", "tuning")
 _BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 _KERNEL = """
@@ -46,8 +49,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in (*PACKAGES, "tests", "benchmarks", "logs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*Z-*", "*.sock"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
+    (source / ".git" / "refs").mkdir(parents=True)
+    (source / ".git" / "HEAD").write_text(f"{COMMIT}\n")
     run(sys.executable, "-c", _BUILD, out, cwd=source)
     (path,) = out.glob("*.whl")
     return path
@@ -86,12 +91,13 @@ def test_the_wheel_holds_the_packages_with_their_data_and_nothing_else(wheel: Pa
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()]
-    assert names == {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
+    expected = {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
+    assert names == expected | {"membrane_ctrl/build_commit.txt"}
     assert {f"{package}/py.typed" for package in PACKAGES} < names
 
 
 def test_an_installed_copy_runs_and_leaves_nothing_behind(installed: Installed) -> None:
-    assert installed.command("--version").strip() == "0.1.0"
+    assert installed.command("--version").strip() == f"membrane-ctrl {__version__} (0123456789ab)"
     (installed.empty / "twin.toml").write_text(installed.command("examples", "twin.toml"))
     assert "twin.toml" in installed.command("check", "twin.toml")
     run(installed.python, "-c", _KERNEL, cwd=installed.empty, XDG_CACHE_HOME=str(installed.folder / "caches"))

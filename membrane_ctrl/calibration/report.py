@@ -18,6 +18,7 @@ from membrane_ctrl.metrology.calibrate import advice, diagnose, parameters, prop
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.model.program import file_origin
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
@@ -27,7 +28,7 @@ def report_of(
 ) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only the findings."""
     table: dict[str, Any] = {
-        "schema": "membrane-calibration/1",
+        **file_origin("membrane-calibration/1"),
         "verdict": "rejected" if any(finding.fatal for finding in findings) else "ok",
         "findings": [{"fatal": finding.fatal, "says": finding.says} for finding in findings],
     }

@@ -18,6 +18,7 @@ from pydantic import Field
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.optics import SigmasConfig
+from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import LensTable
 from membrane_ctrl.metrology.calibrate.parameters import NAMES
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
@@ -30,6 +31,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
 )
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.program import file_origin
 
 _NAMED = 6  # inputs without a stated sigma; the others are counted
 
@@ -98,7 +100,7 @@ def sigmas_of(optics: schema.OpticsConfig) -> dict[str, float]:
 SCHEMA = "membrane-prior/1"
 
 
-class PriorFile(Section):
+class PriorFile(OriginSection):
     """The file of a prior.
 
     `camera` and `geometry` replace those stated in the sets; `sigmas` are those of `calibrate`'s parameters.
@@ -153,4 +155,4 @@ def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Seque
     }
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_text_atomic(files.users(path), tomli_w.dumps({"schema": SCHEMA, **tables, "made": made}))
+        files.write_text_atomic(files.users(path), tomli_w.dumps({**file_origin(SCHEMA), **tables, "made": made}))

@@ -19,6 +19,7 @@ from pydantic import Field
 from firmware_iface.roles import Pattern
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import (
     ArtefactTable,
     GeometryFile,
@@ -53,7 +54,7 @@ class FrameRow(Section):
     displacement_um: float | None = None
 
 
-class CaptureFile(Section):
+class CaptureFile(OriginSection):
     """The content of `capture.toml`."""
 
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, parameter_to_coef
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.program import file_origin
 
 SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
@@ -267,7 +268,7 @@ def stability_command(options: StabilityOptions) -> int:
             raise errors.RejectedError(
                 f"{options.folder}: none of the {len(folders)} sets gave a figure ({run.first_reason})"
             )
-        table = {"schema": "membrane-stability/1", "run": str(options.folder), "size_px": size_px} | run.table()
+        table = {**file_origin("membrane-stability/1"), "run": str(options.folder), "size_px": size_px} | run.table()
         results.write_json(out / "stability.json", table)
         pictures = run.draw()
         if options.rerun:

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
+from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import GeometryFile, read_geometry
 from membrane_ctrl.measure.capture_set import read_image, reference_of, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
@@ -27,6 +28,7 @@ from membrane_ctrl.metrology.track.tracked import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model import errors, files, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_labels
 
 _SAME_REGION = 1e-4  # of its side: rounding of written decimals
@@ -59,7 +61,7 @@ class TrackRow(Section):
     displacement_um: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
 
 
-class TrackFile(Section):
+class TrackFile(OriginSection):
     """The content of a tracking set's `capture.toml`."""
 
     schema_: Annotated[Literal["membrane-capture/1"], Field(alias="schema")]
@@ -215,7 +217,7 @@ def _table(track: Track) -> dict[str, Any]:
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
     return {
-        "schema": "membrane-track/1",
+        **file_origin("membrane-track/1"),
         "frames": len(track.frames),
         "verdicts": {verdict: counts[verdict] for verdict in ("ok", "degraded", "rejected")},
         "usable": len(used),

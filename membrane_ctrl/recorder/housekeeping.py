@@ -40,7 +40,7 @@ class FolderWatch:
     def begin_anew(self, config: Config) -> None:
         """Make the folder again, with its configuration. Raises OSError; the folder is then still `gone`."""
         self._run_dir.mkdir(parents=True, exist_ok=True)
-        run_folder.write_config(self._run_dir, config)
+        run_folder.write_heads(self._run_dir, config)
         self.close()
         self._descriptor = _opened(self._run_dir)
         self._has_config = True

@@ -18,6 +18,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -29,6 +30,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.files import sync_data
 from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered, from_dict
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
@@ -102,7 +104,9 @@ class Recording:
             stream.send_blueprint(blueprint)
             blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
         stream.send_recording_name(self._run_dir.name)
-        stream.send_property("run", rr.AnyValues(name=self._run_name, started_utc=str(self._origin)))
+        origin: dict[str, Any] = {"name": self._run_name, "started_utc": str(self._origin)}
+        origin |= file_origin("membrane-recording/1")
+        stream.send_property("run", rr.AnyValues(**origin))
         for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS, streams.VIBRATIONS):
             stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
         for block in (streams.band(self._config.limits.band_um), streams.CHANGE, streams.SAG, streams.PUMP):

@@ -26,6 +26,7 @@ from membrane_ctrl.controller.tick import Records, TickBatch
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.errors import Exit, InputError
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.run_files import inputs_file, run_folder, table_specs
 from membrane_ctrl.run_files.run import open_run
@@ -232,7 +233,7 @@ def write_incident(
         kept.sync()
     kept.close()
     about = {
-        "schema": SCHEMA,
+        **file_origin(SCHEMA),
         "what": f"replay of {run.folder.resolve().name}",
         "recorded_by": run.inputs.program,
         "decisions": [

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_text_atomic
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
@@ -89,10 +90,10 @@ def _files(
     written = []
     if fields:
         blocks = (named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s))
-        written += _tables(blocks, out / f"ticks.{to}", to)
+        written += _tables(blocks, out / f"ticks.{to}", to, _origin(run))
         _say_if_missing(run, bool(written))
     if SHAPES in extras and (shapes := run.cycles(start_s, end_s)).num_rows:
-        written += _tables(iter([shapes]), out / f"shapes.{to}", to)
+        written += _tables(iter([shapes]), out / f"shapes.{to}", to, _origin(run))
     if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
         path = out / "events.jsonl"
         write_text_atomic(path, "".join(f"{line}\n" for line in lines))
@@ -136,14 +137,20 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
     return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
 
 
-def _tables(tables: Iterator[pa.Table], path: Path, to: str) -> list[Path]:
+def _origin(run: Run) -> dict[str, str]:
+    """Metadata of an exported file; CSV has none."""
+    times = {"run": run.name, "started_utc": run.origin_utc.isoformat(), "recorded_by": run.recorded_by}
+    return file_origin("membrane-export/1") | times
+
+
+def _tables(tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, str]) -> list[Path]:
     """Write tables of one schema one after the other; without tables, write nothing."""
     writer = None
     try:
         for table in tables:
             if writer is None:
                 make = pa.parquet.ParquetWriter if to == "parquet" else pa.csv.CSVWriter
-                writer = make(str(path), table.schema)
+                writer = make(str(path), table.schema.with_metadata(origin))
             writer.write_table(table.cast(writer.schema) if to == "parquet" else table)
     finally:
         if writer is not None:
@@ -160,8 +167,7 @@ def _hdf5(
     except ImportError:
         raise errors.InputError(f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
     with h5py.File(path, "w") as file:
-        file.attrs["run"] = run.name
-        file.attrs["started_utc"] = run.origin_utc.isoformat()
+        file.attrs.update(_origin(run))
         for block in run.tick_blocks(fields, start_s, end_s) if fields else ():
             for name, values in block.items():
                 place = f"ticks/{name}"
@@ -209,12 +215,18 @@ def show_command(run: Path, json: bool) -> int:
     opened.look_through()
     entry = catalogue.entry(opened.folder)
     if json:
-        table = catalogue.as_dict(entry) | {"notes": opened.notes, "summary": opened.summary}
+        table = catalogue.as_dict(entry) | {
+            "recorded_by": opened.recorded_by,
+            "notes": opened.notes,
+            "summary": opened.summary,
+        }
         print(plain_json.dumps(table, indent=1))
         return 0
     _console().print(_table([entry]))
     if besides := beside(entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s):
         print(f"  not counted as held: {', '.join(besides)}")
+    if opened.recorded_by:
+        print(f"  recorded by {one_line(opened.recorded_by)}")
     for each in opened.log:
         match each.event:
             case events.StateEntered(state=said) | events.Fault(name=said) | Mark(text=said) | Ended(exit=said):

@@ -15,7 +15,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.run_files import levels, run_folder, shapes, streams, table_specs
+from membrane_ctrl.run_files import levels, run_folder, run_head, shapes, streams, table_specs
 from membrane_ctrl.run_files.recorded_rate import at_recorded_rate
 from membrane_ctrl.run_files.shapes import Shapes
 from membrane_ctrl.run_files.table_store.reader import TableReader
@@ -49,6 +49,8 @@ class Run:
         UTC at 0 s of the run.
     notes : list of str
         Missing and damaged parts, one line each; reading may add more.
+    recorded_by : str
+        Program, version and commit that made the folder; empty if unknown.
     """
 
     folder: Path
@@ -57,6 +59,7 @@ class Run:
     summary: dict[str, Any] | None
     origin_utc: datetime
     notes: list[str] = field(default_factory=list)
+    recorded_by: str = ""
 
     @property
     def name(self) -> str:
@@ -193,13 +196,14 @@ def open_run(path: str | Path) -> Run:
     """
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []
+    head = run_head.read_run_head(folder, notes)
     log = run_folder.read_events(folder, notes)
     summary = run_folder.read_summary(folder, notes)
     if summary and summary.get("exit") and not any(isinstance(each.event, run_events.Ended) for each in log):
         notes.append("events.jsonl: at least the last line is missing: the run has ended without an end event")
     notes += _missing(folder, summary)
     config = at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
-    return Run(folder, config, log, summary, origin_of(folder, log), notes)
+    return Run(folder, config, log, summary, origin_of(folder, log), notes, head.recorded_by)
 
 
 def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:

@@ -15,7 +15,8 @@ from pydantic import ValidationError
 
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import errors, events, files, plain_json, run_events
+from membrane_ctrl.model import errors, events, files, plain_json, program, run_events
+from membrane_ctrl.run_files import run_head
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
 
@@ -25,7 +26,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
-    """Make `<logs_dir>/20261121T012345Z-<name>` with `config.toml`, including every default.
+    """Make `<logs_dir>/20261121T012345Z-<name>` with `run.json`, and `config.toml` including every default.
 
     A second run in the same second gets the suffix `-2`.
 
@@ -44,16 +45,18 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
     except OSError as error:
         raise _unwritable(logs_dir, error) from None
     try:
-        write_config(run_dir, config)
+        write_heads(run_dir, config)
     except OSError as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         raise _unwritable(run_dir, error) from None
     return run_dir
 
 
-def write_config(run_dir: Path, config: Config) -> None:
-    """Write `config.toml`, including every default. Raises OSError."""
-    files.write_text_atomic(run_dir / CONFIG, plain_json.with_comment(toml_file.dump(config)))
+def write_heads(run_dir: Path, config: Config) -> None:
+    """Write `run.json`, and `config.toml` with every default. Raises OSError."""
+    run_head.write_run_head(run_dir)
+    text = f"# {program.program_identity()}\n{toml_file.dump(config)}"
+    files.write_text_atomic(run_dir / CONFIG, plain_json.with_comment(text))
 
 
 def free_mb(folder: Path) -> float:
@@ -157,6 +160,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
     mark = run_events.Mark(text, _user(), made_utc=datetime.now(UTC).isoformat(timespec="seconds"))
     line = {"time_utc": moment.isoformat(), "mono_s": mono_s} | mark.to_dict()
+    line["program"] = program.program_identity()
     try:
         files.append_text(folder / ANNOTATIONS_FILE, json.dumps(line, ensure_ascii=False) + "\n")
     except OSError as error:

@@ -24,6 +24,7 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScr
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
+from membrane_ctrl.model.program import file_origin
 
 MAX_ITERATIONS = 40
 _SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
@@ -260,7 +261,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     """The content of `geometry.toml`; `optics` is the stated bench."""
     free = [parameters.NAMES.index(name) for name in solution.free]
     tables: dict[str, Any] = {
-        "schema": SCHEMA,
+        **file_origin(SCHEMA),
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
         "covariance": {
             "names": [*GENERAL_NAMES, *_optional(solution)],

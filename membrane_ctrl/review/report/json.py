@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from membrane_ctrl.control import gas
 from membrane_ctrl.model import events
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.catalogue import beside, span
@@ -65,8 +66,9 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
     word, sentence = verdict(analysis)
     late = ticks.lateness_ms
     return {
-        "schema": SCHEMA,
+        **file_origin(SCHEMA),
         "run": run.name,
+        "recorded_by": run.recorded_by,
         "started_utc": run.origin_utc.isoformat(),
         "verdict": word,
         "sentence": sentence,

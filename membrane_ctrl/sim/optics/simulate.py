@@ -12,6 +12,7 @@ import tomli_w
 
 from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.disturbances import drummed
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
@@ -30,7 +31,7 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
     if spec.optics.camera.bits == 8:
         del camera["bits"]  # the default of readers
     camera["principal_px"] = list(spec.optics.camera.principal)
-    table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": spec.kind}
+    table: dict[str, Any] = {**file_origin("membrane-capture/1"), "kind": spec.kind}
     if spec.reference:
         table["reference"] = spec.reference
     if spec.film.bowl == "hencky" and spec.film.sag_mm > 0:
@@ -75,7 +76,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     np.savez_compressed(folder / "truth.npz", displacement_um=displacement_um, **maps)
     film = {name: value for name, value in asdict(spec.film).items() if name != "terms"}
     truth = {
-        "schema": "membrane-simulation/1",
+        **file_origin("membrane-simulation/1"),
         "displacement_um": mean_um,
         "sag_mm": spec.film.sag_at_mm(mean_um),
         "coeffs_um": None if coeffs_um is None else coeffs_um.tolist(),
@@ -212,7 +213,7 @@ def simulate_track(
             on_frame(k + 1)
     pattern_mm = spec.optics.pattern
     crossed = {"periods": _CROSSED_PERIODS, "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS}
-    table: dict[str, Any] = {"schema": "membrane-capture/1", "kind": "track", "reference": "../full"}
+    table: dict[str, Any] = {**file_origin("membrane-capture/1"), "kind": "track", "reference": "../full"}
     table |= {"pattern": _written(pattern_mm) | {"crossed": crossed}, "frames": rows}
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])

@@ -1,0 +1,99 @@
+"""Which program wrote a file: its version and the commit of its source.
+
+All commits before a release have the same version, so the commit is stated beside it. A wheel or a
+source archive carries the commit in `BUILD_FILE`, which the build writes (`setup.py`). In a checkout,
+git describes it. The commit of any other folder is empty.
+"""
+
+import os
+import re
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl import __version__
+
+NAME = "membrane-ctrl"
+PACKAGE = Path(__file__).parents[1]
+BUILD_FILE = "build_commit.txt"
+_COMMIT = re.compile(r"[0-9a-f]{12,64}(-dirty)?")
+_COMMIT_DIGITS = 12
+_GIT_TIMEOUT_S = 5.0
+_REFERENCE_BYTES_MAX = 4096
+
+
+@cache
+def program_commit() -> str:
+    """Commit of the running source: 12 hexadecimal digits, then `-dirty` if files were changed; empty if unknown.
+
+    The first call of a process may start git, which takes some 20 ms. So call it before the first tick.
+    """
+    built = _matching(_read_line(PACKAGE / BUILD_FILE))
+    return built or find_commit(PACKAGE.parent)
+
+
+def program_identity() -> str:
+    """Name, version and commit in one line: `membrane-ctrl 0.1.0 (0123456789ab)`."""
+    return stated_program(file_origin(""))
+
+
+def file_origin(schema: str) -> dict[str, str]:
+    """First members of a JSON or TOML file: its format with version, and the program and commit that wrote it."""
+    return {"schema": schema, "program": f"{NAME} {__version__}", "commit": program_commit()}
+
+
+def stated_program(table: Mapping[str, Any]) -> str:
+    """Program and commit stated in a file's members, as `program_identity`; empty if none is stated."""
+    program, commit = table.get("program"), table.get("commit")
+    if not isinstance(program, str) or not program:
+        return ""
+    return f"{program} ({commit})" if isinstance(commit, str) and commit else program
+
+
+def find_commit(checkout: Path) -> str:
+    """Commit of a checkout's source, as `program_commit`; empty if the folder is no checkout.
+
+    Without git, or where git refuses the folder, the commit is read from `.git`, and changed files go unnoticed.
+    """
+    if not (checkout / ".git").exists():  # a checkout above this folder is another project's
+        return ""
+    return _describe_with_git(checkout) or _read_head(checkout / ".git")
+
+
+def _describe_with_git(checkout: Path) -> str:
+    words = ["git", "describe", "--always", "--dirty", "--exclude=*", f"--abbrev={_COMMIT_DIGITS}"]
+    environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}  # writes nothing, not even a refreshed index
+    try:
+        done = subprocess.run(
+            words,
+            cwd=checkout,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_GIT_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return _matching(done.stdout.decode(errors="replace").strip()) if done.returncode == 0 else ""
+
+
+def _read_head(git: Path) -> str:
+    head = _read_line(git / "HEAD")
+    name = head.removeprefix("ref: ")
+    found = _read_line(git / name) if name != head and ".." not in Path(name).parts else head
+    return _matching(found)[:_COMMIT_DIGITS]
+
+
+def _read_line(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(_REFERENCE_BYTES_MAX).decode(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+def _matching(text: str) -> str:
+    return text if _COMMIT.fullmatch(text) else ""
