@@ -28,7 +28,6 @@ _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
 _.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
 _.screen_x_mm, _.screen_y_mm, _.screen_turn_x_deg, _.screen_turn_y_deg, _.screen_turn_z_deg  # sigmas, read by name
 _.camera_yaw_deg, _.camera_pitch_deg, _.camera_roll_deg, _.focal_relative, _.k1, _.k2, _.p1, _.p2, _.pitch_relative
-pump_map  # of an event of runs of earlier versions
 _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose request has these
 _.enters  # a rule's level for people, in the generated page
 _.by_password  # a login in one call, for tests and programs

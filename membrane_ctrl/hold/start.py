@@ -36,6 +36,7 @@ from membrane_ctrl.instruments.lock_store import LockStore, device_keys, require
 from membrane_ctrl.model import errors, events, run_events, telemetry, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.program import program_identity
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
@@ -292,7 +293,8 @@ async def _run(
             "closing words": closing.heard,
         }
         wiring.told = {"control port": port.told, "systemd": systemd.told}
-        supervisor.tell(run_events.Started(config.devices.name, child.raise_priority(), board.cleared))
+        started = config.devices.name, child.raise_priority(), board.cleared, program_identity()
+        supervisor.tell(run_events.Started(*started))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             _ask_first(supervisor, options.standby, latch, board, keeper.at_start)

@@ -182,7 +182,7 @@ class Supervisor:
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
-        self.tell(run_events.Link(run_events.CONNECTED_AGAIN, up=True))
+        self.tell(run_events.Link("connected again", up=True))
 
     async def _clear_board(self, mask: int) -> None:
         try:

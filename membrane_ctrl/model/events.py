@@ -183,7 +183,6 @@ class ExperimentEnded(Event, kind="experiment", sentence="Experiment {experiment
     experiment: str
     completed: bool
     reason: str
-    pump_map: Any = None
 
 
 class Plausibility(

@@ -7,7 +7,6 @@ from typing import Any
 from membrane_ctrl.model.event_base import KINDS, Event, EventLine, LogLevel, UnknownEvent
 from membrane_ctrl.model.notices import GLITCH_S, NoticeChanges, NoticeKey, Notices, Topic
 
-CONNECTED_AGAIN = "connected again"
 _ENDED_WELL = frozenset({"done", "interrupted"})
 _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
@@ -16,13 +15,17 @@ _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
 
 class Started(
-    Event, kind="start", sentence="Run started[ on {devices}][, {priority} priority][; {message}]", notable=True
+    Event,
+    kind="start",
+    sentence="Run started[ on {devices}][, {priority} priority][; {message}][; {program}]",
+    notable=True,
 ):
-    """The run starts."""
+    """The run starts, under a program with its commit."""
 
     devices: str
     priority: str
     message: str
+    program: str | None = None
 
 
 class Ended(
@@ -452,7 +455,7 @@ def parse(message: bytes) -> EventLine:
 def from_dict(line: EventLine) -> Event:
     """The event of a line, without its times; never raises.
 
-    Keys missing in earlier versions are empty; anything unintelligible is an `UnknownEvent`.
+    Keys that a line lacks are empty; anything unintelligible is an `UnknownEvent`.
     """
     cls = KINDS.get(line["kind"]) if isinstance(line.get("kind"), str) else None
     if cls is None:
@@ -462,8 +465,6 @@ def from_dict(line: EventLine) -> Event:
         value = values[field.name] = line[key] if key in line else _EMPTY.get(field.type)
         if not _fits(value, field.type):
             return UnknownEvent(line)
-    if cls is Link and "up" not in line:  # earlier versions had only the words
-        values["up"] = values["message"] == CONNECTED_AGAIN
     return cls(**values)
 
 

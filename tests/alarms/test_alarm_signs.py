@@ -26,7 +26,7 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ),
         ({"kind": "state", "state": "hold", "from": "settle"}, []),
         ({"kind": "link", "message": "no answer"}, [("link", True, "warning")]),
-        ({"kind": "link", "message": "connected again"}, [("link", False, "warning")]),
+        ({"kind": "link", "message": "connected again", "up": True}, [("link", False, "warning")]),
         ({"kind": "child_ended", "child": "recorder", "exit_code": -9}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_silent", "child": "recorder"}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_given_up", "child": "recorder"}, [("recorder_ended", True, "warning")]),

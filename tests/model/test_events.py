@@ -10,7 +10,7 @@ import pytest
 
 from membrane_ctrl.model.event_base import KINDS, Event, UnknownEvent
 from membrane_ctrl.model.events import CommandTaken, Fault, StateEntered
-from membrane_ctrl.model.run_events import Capture, CommanderChanged, Link, from_dict
+from membrane_ctrl.model.run_events import Capture, CommanderChanged, from_dict
 
 
 def test_keys_stay_in_the_order_of_the_format() -> None:
@@ -48,22 +48,12 @@ def test_what_is_not_understood_is_kept_as_it_is(line: dict[str, Any]) -> None:
     assert event.to_dict() == line
 
 
-def test_what_an_earlier_version_did_not_write_is_empty() -> None:
+def test_a_key_that_a_line_lacks_is_empty() -> None:
     fault = from_dict({"kind": "fault", "name": "late"})
     assert isinstance(fault, Fault)
     assert (fault.code, fault.remedy, fault.latching) == (0, "", False)
     silent = from_dict({"kind": "child_silent", "child": "screen"})
     assert math.isnan(silent.to_dict()["overdue_s"])
-
-
-@pytest.mark.parametrize(
-    ("line", "up"),
-    [({"message": "connected again"}, True), ({"message": "no answer"}, False), ({"message": "x", "up": True}, True)],
-)
-def test_a_link_of_a_run_that_has_only_words_for_it(line: dict[str, Any], up: bool) -> None:
-    event = from_dict({"kind": "link", **line})
-    assert isinstance(event, Link)
-    assert event.up == up
 
 
 def test_the_numbers_of_an_event_do_not_depend_on_its_words() -> None:
