@@ -130,7 +130,7 @@ def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
     for spec in table_specs.ALL:
         left = sorted((run_dir / spec.name).glob(f"*{JOURNAL_SUFFIX}"))
         if left and in_place:
-            TableWriter(run_dir, spec, resumed=True).close()
+            TableWriter(run_dir, table_specs.with_origin(spec), resumed=True).close()
         action = (
             "made parts of them" if in_place else "readable by `open_run`; --in-place makes parts for other programs"
         )

@@ -14,6 +14,7 @@ import pyarrow as pa
 from membrane_ctrl.controller.tick import RECORD, SAME, Records
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray
+from membrane_ctrl.model.program import stated_program
 from membrane_ctrl.run_files import run_tables, shapes, table_specs
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import TableSpec
@@ -56,8 +57,8 @@ class InputsReader:
 
     @property
     def program(self) -> str:
-        """The program that wrote them; empty if unknown."""
-        return self._reader(table_specs.INPUTS).metadata().get("program", "")
+        """The program that wrote them, with its commit; empty if unknown."""
+        return stated_program(self._reader(table_specs.INPUTS).metadata())
 
     def __iter__(self) -> Iterator[InputsFrame]:
         """Yield all frames in order, each with the rare parts and shapes up to its end."""

@@ -40,7 +40,8 @@ class RunTables:
         self, run_dir: Path, origin_utc: datetime | None = None, resumed: levels.OpenWindows | None = None
     ) -> None:
         self._origin_utc = origin_utc
-        self._writers = {spec.name: TableWriter(run_dir, spec, resumed is not None) for spec in table_specs.ALL}
+        specs = map(table_specs.with_origin, table_specs.ALL)
+        self._writers = {spec.name: TableWriter(run_dir, spec, resumed is not None) for spec in specs}
         self._windows = resumed or levels.OpenWindows()
         self._covariance_due_s = -math.inf
 

@@ -1,18 +1,19 @@
 """The tables of a run: their names and columns, with unit and description in the metadata of each field."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 
-from membrane_ctrl import __version__
 from membrane_ctrl.controller.tick import RECORD, SAME
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, TelemetryColumn, unit_of
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import levels
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 
 FORMAT = "membrane-table/1"
-PROGRAM = f"membrane-ctrl {__version__}"
 # Fields of a tick's record that are no column of its telemetry row, and are not repeated in it: the table of inputs.
 INPUT_FIELDS: tuple[str, ...] = tuple(name for name in RECORD.names or () if name not in SAME or name == "now_s")
 # By the field of a record: the column of the telemetry row with that reading or time, exact or derived.
@@ -41,8 +42,14 @@ def _spec(
     group_rows: int = 30_000,
     layout: tuple[tuple[str, str], ...] = (),
 ) -> TableSpec:
-    about = {"format": FORMAT, "table": name, "program": PROGRAM, **dict(layout)}
+    about = {"schema": FORMAT, "table": name, **dict(layout)}
     return TableSpec(name, pa.schema(fields, metadata=about), time_name, group_rows, layout)
+
+
+def with_origin(spec: TableSpec) -> TableSpec:
+    """A table whose files state the running program and its commit."""
+    about = {**file_origin(FORMAT), "table": spec.name, **dict(spec.layout)}
+    return replace(spec, schema=spec.schema.with_metadata(about))
 
 
 def _tick_field(column: TelemetryColumn) -> pa.Field:

@@ -11,9 +11,12 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.model.plain_json import dumps_checked
-from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.run_head import FORMAT, HEAD_FILE, RunHead, read_run_head
+from membrane_ctrl.run_files.run_tables import RunTables
+from membrane_ctrl.run_files.table_specs import EVENTS
+from membrane_ctrl.run_files.table_store.reader import TableReader
 
 
 @pytest.fixture
@@ -63,3 +66,12 @@ def test_an_edited_head_is_not_used(folder: Path) -> None:
     notes: list[str] = []
     assert read_run_head(folder, notes) == RunHead()
     assert len(notes) == 1
+
+
+def test_every_table_states_format_program_and_commit(tmp_path: Path) -> None:
+    tables = RunTables(tmp_path)
+    tables.add_events([{"mono_s": 1.0, "kind": "why", "why": "x"}])
+    tables.close()
+    found = TableReader(tmp_path, EVENTS, []).metadata()
+    assert found["schema"] == "membrane-table/1"
+    assert stated_program(found) == program_identity()

@@ -96,7 +96,7 @@ class TableReader:
         return None
 
     def metadata(self) -> dict[str, str]:
-        """The table's own metadata, as in its first readable file: program, format."""
+        """The table's own metadata, as in its first readable file: schema, program, commit."""
         for number in self.numbers:
             schema = self._schema_of(number)
             if schema is not None:
