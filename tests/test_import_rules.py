@@ -33,14 +33,14 @@ FLOORS = {
     3: {"membrane_ctrl/control", "membrane_ctrl/instruments", "membrane_ctrl/metrology", "membrane_ctrl/processes"},
     4: {"membrane_ctrl/alarms", "membrane_ctrl/controller", "membrane_ctrl/geometry", "membrane_ctrl/sim"},
     5: {"membrane_ctrl/control_port", "membrane_ctrl/measure", "membrane_ctrl/run_files"},
-    6: {"membrane_ctrl/acquisition", "membrane_ctrl/console", "membrane_ctrl/recorder", "membrane_ctrl/sessions"},
-    7: {
-        "membrane_ctrl/calibration",
-        "membrane_ctrl/commissioning",
-        "membrane_ctrl/hold",
+    6: {
+        "membrane_ctrl/acquisition",
+        "membrane_ctrl/console",
+        "membrane_ctrl/recorder",
         "membrane_ctrl/replay",
-        "membrane_ctrl/review",
+        "membrane_ctrl/sessions",
     },
+    7: {"membrane_ctrl/calibration", "membrane_ctrl/commissioning", "membrane_ctrl/hold", "membrane_ctrl/review"},
     8: {"membrane_ctrl/cli", "membrane_ctrl/web", "tuning"},
     9: {"membrane_ctrl/__main__", "membrane_ctrl/doors"},
 }
