@@ -155,7 +155,8 @@ def _zernike_table(index: str, seen: ExportedMap, table: dict[str, Any], where: 
         except (TypeError, ValueError):
             coeffs, radius = np.zeros(0), math.nan
         if coeffs.shape != (ZERNIKE_TERMS,) or not (np.isfinite(coeffs).all() and radius > 0):
-            raise errors.InputError(f"{where / 'result.json'}: zernike: needs {ZERNIKE_TERMS} coefficients, a radius")
+            wanted = f"needs {ZERNIKE_TERMS} coefficients (it has {coeffs.size}) and a radius"
+            raise errors.InputError(f"{where / 'result.json'}: zernike: {wanted}")
         orders, first, normalisation = [zernike.noll(j + 1) for j in range(ZERNIKE_TERMS)], 1, "rms"
         if index == "osa":
             coeffs, orders, first = zernike.osa_from_noll(coeffs), sorted(orders), 0

@@ -72,7 +72,11 @@ def test_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     [
         (None, Exit.BAD_INPUT, "neither a run nor the result of `membrane-ctrl track`"),
         ({"time_s": np.arange(5.0)}, Exit.BAD_INPUT, "lacks an array"),
-        ({"time_s": np.arange(9.0), "coeffs_um": np.zeros((9, 4))}, Exit.BAD_INPUT, f"not {ZERNIKE_TERMS} terms"),
+        (
+            {"time_s": np.arange(9.0), "coeffs_um": np.zeros((9, 4))},
+            Exit.BAD_INPUT,
+            f"9 x 4 numbers where times x terms are 9 x {ZERNIKE_TERMS}",
+        ),
         ({"time_s": np.array([]), "coeffs_um": np.zeros((0, ZERNIKE_TERMS))}, Exit.REJECTED, "no usable figures"),
         (
             {"time_s": np.arange(90.0), "coeffs_um": np.zeros((90, ZERNIKE_TERMS))},

@@ -109,7 +109,9 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
         except (OSError, ValueError) as error:
             raise errors.InputError(f"{path}: {error}") from None
         if coeffs_um.shape != (time_s.size, ZERNIKE_TERMS):
-            raise errors.InputError(f"{path}: coeffs_um: not {ZERNIKE_TERMS} terms for each time_s")
+            found = " x ".join(str(size) for size in coeffs_um.shape)
+            wanted = f"{time_s.size} x {ZERNIKE_TERMS}"
+            raise errors.InputError(f"{path}: coeffs_um: {found} numbers where times x terms are {wanted}")
         origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
     good = np.isfinite(time_s) & (verdict != "rejected") & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
     order = np.argsort(time_s[good], kind="stable")
