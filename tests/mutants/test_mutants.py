@@ -6,7 +6,20 @@ from collections import Counter
 
 import mutants
 import pytest
-from mutants import CAMPAIGN_GOAL, DOCUMENT, ROOT, TESTS_GOAL, count_kills, current_verdicts, document, load, removes
+from mutants import (
+    CAMPAIGN_GOAL,
+    DOCUMENT,
+    ROOT,
+    SAFETY,
+    TESTS_GOAL,
+    count_kills,
+    current_verdicts,
+    document,
+    load,
+    removes,
+)
+
+from membrane_ctrl.controller.safety import TABLE
 
 
 def test_every_mutation_applies_exactly_once_and_is_python(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -15,6 +28,17 @@ def test_every_mutation_applies_exactly_once_and_is_python(monkeypatch: pytest.M
     for mutant in load()[0]:
         text = mutant.place(ROOT).read_text(encoding="utf-8")
         assert mutant.applied(text) != text, mutant.what
+
+
+def test_each_rule_of_the_safety_table_is_made_to_never_trip() -> None:
+    made = [mutant for mutant in load()[0] if mutant.rule]
+    assert [(mutant.rule, mutant.what) for mutant in made] == [(r.name, f"{r.name} never trips") for r in TABLE]
+    for mutant in made:
+        assert removes(mutant) == mutant.rule
+        scope: dict[str, object] = {}
+        exec(mutant.applied(SAFETY.read_text(encoding="utf-8")), scope)
+        mutated = {rule.name: rule for rule in scope["TABLE"]}  # type: ignore[attr-defined]
+        assert not mutated[mutant.rule].broken(None, None)
 
 
 def test_there_are_enough_and_no_two_are_called_the_same() -> None:
