@@ -154,7 +154,7 @@ class Observer:
             foreign=reading.foreign if reading else 0,
             lateness_ms=inputs.lateness_ms,
             dead_tasks=inputs.dead_tasks,
-            vent_fraction=reading.vent_fraction if reading else math.nan,
+            reading=reading,
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -48,7 +48,6 @@ class Observation:
     runs_on: str = ""  # the read-back of a pump that should have stopped
     inflow: str = ""  # how the mirror rises although the pump is commanded off
     locked: str = ""  # the locks that people have set, in words
-    vent_fraction: float = math.nan  # the vent's read-back; NaN without one
     foreign: int = 0  # changes by another program: claim, watchdog (`roles.FOREIGN_...`)
     gauge_same_s: float = 0.0  # how long a taut film's gauge readings have been bit-identical
     gauge_jumps: int = 0  # consecutive readings that no film can cause
@@ -61,6 +60,12 @@ class Observation:
     open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
     interlock_level: SafeLevel = SafeLevel.NONE  # the deepest level of the open ones
     interlock_words: str = ""  # the open ones with their texts
+    reading: BenchReading | None = None  # the device's answer of this tick, for properties that need no memory
+
+    @property
+    def vent_fraction(self) -> float:
+        """The vent's read-back; NaN without one."""
+        return self.reading.vent_fraction if self.reading else math.nan
 
     @property
     def depth_um(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from firmware_iface.register_map import default_map
+from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
@@ -23,6 +24,7 @@ RULES = {rule.name: rule for rule in TABLE}
 LINK_LOST, LATE = RULES["link_lost"], RULES["late"]
 CONFIG = ResumeConfig(faults=("link_lost",), wait_s=10.0, most_per_day=2)
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
+SHUT = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.0, False, 0)
 GONE = Observation(
     link_up=True,
     reading_age_s=0.0,
@@ -36,7 +38,7 @@ GONE = Observation(
     watchdog_tripped=False,
     board_faults=0,
     lateness_ms=0.0,
-    vent_fraction=0.0,
+    reading=SHUT,
 )
 LOST = replace(GONE, link_up=False)
 
@@ -78,7 +80,7 @@ def test_what_never_resumes_is_not_possible_although_it_is_listed() -> None:
         replace(GONE, board_faults=OVER_PRESSURE),
         replace(GONE, board_faults=OVER_PRESSURE | WATCHDOG),
         replace(GONE, board_faults=1 << 9),
-        replace(GONE, vent_fraction=1.0),
+        replace(GONE, reading=replace(SHUT, vent_fraction=1.0)),
         replace(GONE, locked="hands inside"),
         replace(GONE, foreign=1),
     ],
