@@ -88,7 +88,7 @@ def modes(
 
 def export_figure(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of `measure`.")],
-    form: Annotated[str, typer.Option("--format", help="zygo-dat, zygo-xyz, codev-int or h5.")],
+    form: Annotated[str, typer.Option("--format", help="zygo-dat, zygo-xyz, codev-int, h5 or fits.")],
     remove: Annotated[
         str, typer.Option(metavar="LIST", help="Take off piston, tilt, power, sphere; separated by commas.")
     ] = "",

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.measure.export_fits import fits_bytes
 from membrane_ctrl.measure.results import read_arrays
 from membrane_ctrl.metrology.figure import LEAST_CELLS
 from membrane_ctrl.metrology.optics import surface, zernike
@@ -273,9 +274,15 @@ def _h5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
     return memory.getvalue(), None
 
 
+def _fits_file(seen: ExportedMap, _: object) -> Written:
+    """FITS: path difference, mask and height."""
+    return fits_bytes(seen.x_mm, seen.y_mm, seen.height_mm, seen.removed), None
+
+
 _WRITERS: dict[str, tuple[str, Callable[[ExportedMap, dict[str, Any] | None], Written]]] = {
     "zygo-dat": (".dat", _zygo_dat),
     "zygo-xyz": (".xyz", _zygo_xyz),
     "codev-int": (".int", _codev_int),
     "h5": (".h5", _h5),
+    "fits": (".fits", _fits_file),
 }
