@@ -18,8 +18,7 @@ import tomli_w
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
-from membrane_ctrl.model import events, run_events, telemetry
-from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model import events, program, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
@@ -219,7 +218,7 @@ def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
 def _description(
     content: _Set, optics: OpticsConfig, patterns: dict[str, Pattern], reference: str | None
 ) -> dict[str, Any]:
-    table: dict[str, Any] = {**file_origin("membrane-capture/1"), "kind": content.kind}
+    table: dict[str, Any] = {**program.file_origin("membrane-capture/1"), "kind": content.kind}
     if reference is not None:
         table["reference"] = reference
     table |= optics.model_dump(mode="json", exclude_none=True)

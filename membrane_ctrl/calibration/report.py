@@ -15,10 +15,9 @@ from matplotlib.figure import Figure
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.metrology.calibrate import advice, diagnose, parameters, propagate, residuals, solve, verdict
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
-from membrane_ctrl.model.program import file_origin
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
@@ -28,7 +27,7 @@ def report_of(
 ) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only the findings."""
     table: dict[str, Any] = {
-        **file_origin("membrane-calibration/1"),
+        **program.file_origin("membrane-calibration/1"),
         "verdict": "rejected" if any(finding.fatal for finding in findings) else "ok",
         "findings": [{"fatal": finding.fatal, "says": finding.says} for finding in findings],
     }

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.cli import calibrating, ctl, holding, optics, reviewing
-from membrane_ctrl.model import errors, terminal
-from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.model import errors, program, terminal
 
 # Markdown, because Rich's own markup takes [devices] in a help text for a style
 app = typer.Typer(
@@ -64,7 +63,7 @@ def _file_trouble(error: OSError) -> str:
 def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
     """Hold a pneumatic membrane mirror to the micrometre and measure its figure meanwhile."""
     if version:
-        print(program_identity())
+        print(program.program_identity())
         raise typer.Exit
 
 

@@ -29,9 +29,8 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     moved_bench,
     stated_spread,
 )
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.program import file_origin
 
 _NAMED = 6  # inputs without a stated sigma; the others are counted
 
@@ -155,4 +154,6 @@ def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Seque
     }
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        files.write_text_atomic(files.users(path), tomli_w.dumps({**file_origin(SCHEMA), **tables, "made": made}))
+        files.write_text_atomic(
+            files.users(path), tomli_w.dumps({**program.file_origin(SCHEMA), **tables, "made": made})
+        )

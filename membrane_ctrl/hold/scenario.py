@@ -23,8 +23,7 @@ from membrane_ctrl.hold import scenario, scenarios
 from membrane_ctrl.hold.closing_words import Closing, report
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model import clock, run_events, telemetry, terminal
-from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.model import clock, program, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -274,7 +273,7 @@ def _record(
         readers = {n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n]))) for n in recorded}
         recording = sink.Recording(run_dir, name, virtual.clock, config)
         files = recorder.Recorder(run_dir, virtual.clock, config, readers, recording, None, virtual.tell)
-        virtual.tell(run_events.Started("the twin in virtual time", "ordinary", "", program_identity()))
+        virtual.tell(run_events.Started("the twin in virtual time", "ordinary", "", program.program_identity()))
         due_s = round_s
         for _ in ticks:
             if virtual.now_s >= due_s:

@@ -15,9 +15,8 @@ from membrane_ctrl.metrology import film_fit
 from membrane_ctrl.metrology.optics.film_law import FilmLaw
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.uncertainty import monte_carlo
-from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
 
 # The paper's film, to which an unknown one is compared
 _STIFFNESS_N_PER_M, _POISSON, _PRESSURE_PA, _PAPER_EDGE_MM = 2.05e5, 0.3, 600.0, 3.0
@@ -153,7 +152,7 @@ def _table(
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
     edge = [float(profile[-1]) for profile in departure.seen_mm]
     return {
-        **file_origin("membrane-film/1"),
+        **program.file_origin("membrane-film/1"),
         "sets": [
             {
                 "set": figure.name,

@@ -22,10 +22,9 @@ from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.optics.geometry import Outline
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.metrology.uncertainty.budget import Budget
-from membrane_ctrl.model import errors, zernike_terms
+from membrane_ctrl.model import errors, program, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
-from membrane_ctrl.model.program import file_origin
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
@@ -118,7 +117,7 @@ def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[
         "flagged_frames": measurement.flagged_files(),
     }
     return {
-        **file_origin("membrane-result/1"),
+        **program.file_origin("membrane-result/1"),
         "zernike": {"index": "noll", "first": 1, "normalisation": "rms", "radius_mm": radius_mm, "coeffs_um": coeffs},
         "fit": _fit_table(full),
         "quality": quality,

@@ -18,9 +18,8 @@ from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure import capture_set, measurement, results, stability_results
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
-from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
 
 SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
@@ -268,7 +267,11 @@ def stability_command(options: StabilityOptions) -> int:
             raise errors.RejectedError(
                 f"{options.folder}: none of the {len(folders)} sets gave a figure ({run.first_reason})"
             )
-        table = {**file_origin("membrane-stability/1"), "run": str(options.folder), "size_px": size_px} | run.table()
+        table = {
+            **program.file_origin("membrane-stability/1"),
+            "run": str(options.folder),
+            "size_px": size_px,
+        } | run.table()
         results.write_json(out / "stability.json", table)
         pictures = run.draw()
         if options.rerun:

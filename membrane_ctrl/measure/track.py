@@ -26,9 +26,8 @@ from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, separable
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracked import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.track.tracker import Tracker
-from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray, Image
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_labels
 
 _SAME_REGION = 1e-4  # of its side: rounding of written decimals
@@ -217,7 +216,7 @@ def _table(track: Track) -> dict[str, Any]:
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
     return {
-        **file_origin("membrane-track/1"),
+        **program.file_origin("membrane-track/1"),
         "frames": len(track.frames),
         "verdicts": {verdict: counts[verdict] for verdict in ("ok", "degraded", "rejected")},
         "usable": len(used),

@@ -18,9 +18,8 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
 from membrane_ctrl.measure.results import error_bars, write_arrays, write_json
 from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
-from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.processes.child import results_of
 
 # Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to twelve digits.
@@ -147,7 +146,7 @@ def _table(
     coeffs = np.sqrt(np.diag(parameter_to_coeffs() @ result.covariance @ parameter_to_coeffs().T))
     sag = sag_gradient()
     return {
-        **file_origin("membrane-uncertainty/1"),
+        **program.file_origin("membrane-uncertainty/1"),
         "set": str(options.folder),
         "against": None if options.against is None else str(options.against),
         "verdicts": [{"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason} for one in sets],

@@ -15,9 +15,8 @@ import pyarrow.parquet
 from rich.console import Console
 from rich.table import Table
 
-from membrane_ctrl.model import errors, events, plain_json, terminal
+from membrane_ctrl.model import errors, events, plain_json, program, terminal
 from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_text_atomic
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
@@ -140,7 +139,7 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
 def _origin(run: Run) -> dict[str, str]:
     """Metadata of an exported file; CSV has none."""
     times = {"run": run.name, "started_utc": run.origin_utc.isoformat(), "recorded_by": run.recorded_by}
-    return file_origin("membrane-export/1") | times
+    return program.file_origin("membrane-export/1") | times
 
 
 def _tables(tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, str]) -> list[Path]:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import events, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import events, program, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 
 # Statistics of a run of any length in constant memory.
@@ -249,7 +248,7 @@ class Summary:
         held = means if means["seconds"] else self._reading_1s_um.result()
         fault = fault_of_end(self._standing_fault(), self._end.get("exit"))
         return {
-            **file_origin(SCHEMA),
+            **program.file_origin(SCHEMA),
             "exit": self._end.get("exit"),
             "duration_s": max(self._time_s, float(self._end.get("mono_s") or 0.0)),
             "true_std_um": true.std,

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from membrane_ctrl.model import errors, events, files, plain_json, run_events, terminal
-from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model import errors, events, files, plain_json, program, run_events, terminal
 from membrane_ctrl.processes.child import results_of
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
@@ -119,7 +118,7 @@ def fleet_command(options: FleetOptions) -> int:
             rows.append(_row(line, report.curve))
         if all("problem" in line for line in lines):
             raise errors.FindingsError([f"{line['name']}: {line['problem']}" for line in lines])
-        text = plain_json.dumps({**file_origin(SCHEMA), "runs": lines}, indent=1)
+        text = plain_json.dumps({**program.file_origin(SCHEMA), "runs": lines}, indent=1)
         files.make_folder(out)
         files.write_text_atomic(out / "fleet.json", text + "\n")
         files.write_text_atomic(out / "fleet.html", _page(lines, rows))

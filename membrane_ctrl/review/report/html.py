@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from membrane_ctrl.model import errors, files, plain_json
-from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.model import errors, files, plain_json, program
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span
 from membrane_ctrl.review.report import figures
@@ -91,7 +90,7 @@ def render(
         parts.append(f"<figure>{figures.overview(other)}</figure>")
     parts.append(_section("Timeline", _timeline(analysis)))
     recorded = f", recorded by {_text(run.recorded_by)}" if run.recorded_by else ""
-    parts.append(f"<footer>{program_identity()}, report of {_text(str(run.folder.name))}{recorded}</footer>")
+    parts.append(f"<footer>{program.program_identity()}, report of {_text(str(run.folder.name))}{recorded}</footer>")
     return html_page(run.name, "".join(parts))
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from membrane_ctrl.control import gas
-from membrane_ctrl.model import events
-from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model import events, program
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.catalogue import beside, span
@@ -66,7 +65,7 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
     word, sentence = verdict(analysis)
     late = ticks.lateness_ms
     return {
-        **file_origin(SCHEMA),
+        **program.file_origin(SCHEMA),
         "run": run.name,
         "recorded_by": run.recorded_by,
         "started_utc": run.origin_utc.isoformat(),

@@ -24,9 +24,8 @@ import numpy as np
 
 from membrane_ctrl.measure.results import write_figure, write_json
 from membrane_ctrl.metrology.optics.film_law import FilmLaw
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.run_files.run import Run, open_run
 
 LEAST = 8  # readings: fewer determine no law
@@ -163,7 +162,7 @@ def _readings(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _table(runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_log: float) -> dict[str, Any]:
     return {
-        **file_origin("membrane-creep/1"),
+        **program.file_origin("membrane-creep/1"),
         "runs": [run.name for run in runs],
         "hours": creep.span_s / 3600,
         "stiffness_n_per_m": float(np.median(stiffness)),

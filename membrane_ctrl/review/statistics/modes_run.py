@@ -12,9 +12,8 @@ import numpy as np
 from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, LEAST_S, MOVED, SEARCH_S, VibrationMode, find_modes
-from membrane_ctrl.model import errors, files, terminal
+from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import is_run
@@ -155,7 +154,7 @@ def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
 
 def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:
     return {
-        **file_origin("membrane-modes/1"),
+        **program.file_origin("membrane-modes/1"),
         "sources": [folder.name for folder in folders],
         "searches": searches,
         "modes": [
