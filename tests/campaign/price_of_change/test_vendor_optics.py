@@ -39,7 +39,15 @@ pixel_mm = 0.4
 {screen}
 """
 QUICK_SCREEN = "settle_ms = 10.0\nlinearise = false\nself_test = false\n"
+# patient: the machine may pause
 INSTRUMENTS = """
+[limits]
+stale_s = 2.0
+lateness_max_ms = 1900.0
+
+[devices]
+watchdog_s = 2.0
+
 [loop]
 rate_hz = 20.0
 feedforward_barometer = false
@@ -60,16 +68,19 @@ driver = "optoncdt1420"
 port = "/dev/ttyUSB0"
 range_mm = 50
 rate_khz = 2
+timeout_s = 0.9
 
 [devices.pump]
 driver = "bronkhorst_modbus"
 link = "rtu:///dev/ttyUSB1?baud=115200&parity=E"
 unit_id = 3
+timeout_s = 0.9
 
 [devices.gauge_pressure]
 driver = "bronkhorst_modbus"
 link = "rtu:///dev/ttyUSB1?baud=115200&parity=E"
 unit_id = 5
+timeout_s = 0.9
 """
 # in the room the camera's pixels are 10 x 10 of the screen's
 IN_THE_ROOM = """
@@ -148,13 +159,15 @@ class Hold:
         config = folder / "lab.toml"
         config.write_text(INSTRUMENTS + OPTICS.format(camera=camera, screen=QUICK_SCREEN))
         words = ["hold", "--twin", "--devices", config, "--logs", self._logs, "--json"]
-        self._process = started(site, *words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._console = folder / "console.txt"
+        with self._console.open("w") as console:
+            self._process = started(site, *words, stdout=subprocess.PIPE, stderr=console)
 
     def until(self, happened: Callable[[list[dict[str, Any]]], bool]) -> None:
         give_up_s = time.monotonic() + PATIENCE_S
         while not happened(self.events()):
             assert time.monotonic() < give_up_s, self.events()[-5:]
-            assert self._process.poll() is None, self.events()[-5:]
+            assert self._process.poll() is None, self._console.read_text()
             time.sleep(0.2)
 
     def events(self) -> list[dict[str, Any]]:
@@ -170,9 +183,10 @@ class Hold:
         return summary
 
     def kill(self) -> None:
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.communicate()
+        self._process.kill()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._process.wait()
 
 
 def said(events: list[dict[str, Any]], words: str) -> bool:
