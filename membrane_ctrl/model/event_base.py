@@ -104,7 +104,7 @@ class Event:
         template = self._choose_template()
         line = self.to_dict()
         values = {name: getattr(self, name) for name in prose.fields_of(template) if hasattr(self, name)} | line
-        shown = {name: ", ".join(v) if isinstance(v, tuple | list) else v for name, v in values.items()}
+        shown = {name: ", ".join(map(str, v)) if isinstance(v, tuple | list) else v for name, v in values.items()}
         try:
             filled = prose.fill(template, shown)
         except (ValueError, TypeError):  # a number that is none

@@ -176,7 +176,7 @@ class RunTables:
 
 
 def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:
-    """Telemetry as the table of ticks has it: missing values null, computed numbers rounded."""
+    """Telemetry as the table of ticks has it: missing values null, computed numbers with seven digits."""
     arrays = []
     for field in table_specs.TICKS.schema:
         values = np.ascontiguousarray(row[field.name], dtype=np.float64)
@@ -186,8 +186,7 @@ def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:
             # a reading that is another NaN than the missing value keeps its bits, for replays
             arrays.append(pa.array(values, mask=values.view(np.uint64) == _MISSING_BITS, from_pandas=False))
         else:
-            rounded = table_specs.rounded(values, table_specs.resolution_of(field.name))
-            arrays.append(pa.array(rounded.astype(np.float32), mask=np.isnan(values)))
+            arrays.append(pa.array(values.astype(np.float32), mask=np.isnan(values)))
     return pa.record_batch(arrays, schema=table_specs.TICKS.schema)
 
 

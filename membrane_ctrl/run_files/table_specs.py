@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pyarrow as pa
 
 from membrane_ctrl.controller.tick import RECORD, SAME
@@ -20,9 +19,6 @@ INPUT_FIELDS: tuple[str, ...] = tuple(name for name in RECORD.names or () if nam
 ROW_COLUMNS: dict[str, str] = {
     name: SAME.get(name, name) for name in RECORD.names or () if SAME.get(name, name) in COLUMNS
 }
-# Computed numbers are rounded to a power of two that is finer than any sensor (the laser's 0.1 nm): a third of the
-# bytes of a day. Readings and commands are exact.
-_RESOLUTION = {"µm": 2.0**-14, "µm/s": 2.0**-14, "σ": 2.0**-10, "": 2.0**-18}
 # The covariance of one cycle in this time is enough for a report: a month of all would be 3 GB.
 COVARIANCE_INTERVAL_S = 600.0
 # A row of these holds 3 kB, a thumbnail 10 kB.
@@ -57,19 +53,12 @@ def _tick_field(column: TelemetryColumn) -> pa.Field:
         return _field(column.name, pa.int64(), column.description)
     if is_exact(column.name):
         return _field(column.name, pa.float64(), column.description)
-    resolution = resolution_of(column.name)
-    about = {"resolution": repr(resolution)} if resolution else {}
-    return _field(column.name, pa.float32(), column.description, **about)
+    return _field(column.name, pa.float32(), column.description)
 
 
 def is_exact(name: str) -> bool:
     """Whether a column of a tick's row is a reading or a time, and recorded to the bit."""
     return name in ROW_COLUMNS.values()
-
-
-def resolution_of(name: str) -> float | None:
-    """Step to which a computed column is rounded; None for one that is not rounded."""
-    return None if is_exact(name) else _RESOLUTION.get(COLUMNS[name].unit)
 
 
 def _input_field(name: str) -> pa.Field:
@@ -208,8 +197,3 @@ THUMBNAILS = _spec(
 ALL: tuple[TableSpec, ...] = (
     TICKS, INPUTS, RARE, SHAPES, TRACKED, COVARIANCES, *LEVELS.values(), EVENTS, MARKS, THUMBNAILS
 )  # fmt: skip
-
-
-def rounded(values: np.ndarray, resolution: float | None) -> np.ndarray:
-    """Values rounded to whole steps; as they are without a resolution."""
-    return values if resolution is None else np.round(values / resolution) * resolution

@@ -38,12 +38,14 @@ def test_only_a_recording_that_is_there_is_offered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "open it" not in words(tmp_path, capsys)
-    (tmp_path / "hold-000.rrd").touch()
+    (tmp_path / "ticks").mkdir()
+    assert "open it" not in words(tmp_path, capsys)
+    (tmp_path / "ticks" / "ticks-0000.journal").touch()
     assert f"open it:    membrane-ctrl review {tmp_path}\n" in words(tmp_path, capsys)
     monkeypatch.chdir(tmp_path)
     run_dir = Path("logs/20261122T031200Z-hold")
-    run_dir.mkdir(parents=True)
-    (run_dir / "hold-000.rrd").touch()
+    (run_dir / "ticks").mkdir(parents=True)
+    (run_dir / "ticks" / "ticks-0000.parquet").touch()
     assert "open it:    membrane-ctrl review last\n" in words(run_dir, capsys)
 
 

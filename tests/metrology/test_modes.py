@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl.metrology.track import live
 from membrane_ctrl.metrology.track.live import Heard, Stethoscope
 from membrane_ctrl.metrology.track.modes import VibrationMode, find_modes
-from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver, sentence
+from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 from membrane_ctrl.model.run_events import Vibrations, from_dict
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from tests.support.vibrating_mirror import watched
@@ -320,4 +320,4 @@ def test_a_listener_hears_what_is_planted() -> None:
 def test_what_was_heard_survives_the_line_to_the_hold_and_has_a_sentence() -> None:
     event = Vibrations([48.0, None], [5.0, None], "48.00 Hz 5.0 nm")
     assert from_dict(event.to_dict()) == event
-    assert sentence(event.to_dict()) == "Vibrations of the mirror: 48.00 Hz 5.0 nm"
+    assert event.sentence == "Vibrations of the mirror: 48.00 Hz 5.0 nm"

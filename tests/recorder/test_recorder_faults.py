@@ -26,7 +26,7 @@ from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
 from membrane_ctrl.recorder.sink import Recording, RecordingError
 from membrane_ctrl.run_files.inputs_file import InputsReader
-from membrane_ctrl.run_files.run_folder import write_config
+from membrane_ctrl.run_files.run_folder import write_heads
 from membrane_ctrl.run_files.table_store.disk import Disk
 from tests.support.rrd_reading import scalars
 from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
@@ -200,7 +200,7 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
     run_dir = tmp_path / "run"
     config = Config()
     run_dir.mkdir()
-    write_config(run_dir, config)
+    write_heads(run_dir, config)
     for bench in make_bench(run_dir, config):
         bench.writers["events"].put(b'{"kind": "start", "mono_s": 0.0}')
         bench.second(0)

@@ -23,7 +23,7 @@ from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.spectra import WithoutFeedforward
 from membrane_ctrl.run_files.summary import HoldParts
-from tests.support.review_runs import same, set_summary, written
+from tests.support.review_runs import same, written
 
 HOURS = 0.5
 
@@ -87,11 +87,13 @@ def test_the_benefit_of_the_feedforward_is_that_of_a_loop_without() -> None:
     assert np.std(without) > 3 * np.std(with_it)
 
 
-def test_a_missing_segment_is_named(tmp_path: Path) -> None:
+def test_the_report_needs_no_segment(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.05)
-    set_summary(folder, recorder={"segments": 2})
-    names = [anomaly.name for anomaly in analyse(open_run(folder)).anomalies]
-    assert "incomplete recording" in names
+    before = plain_json.dumps(report_table(analyse(open_run(folder))))
+    (folder / "night-000.rrd").write_bytes(b"no recording")
+    assert plain_json.dumps(report_table(analyse(open_run(folder)))) == before
+    (folder / "night-000.rrd").unlink()
+    assert plain_json.dumps(report_table(analyse(open_run(folder)))) == before
 
 
 def test_shape_figures(quiet_run: Path) -> None:

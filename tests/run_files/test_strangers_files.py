@@ -168,7 +168,7 @@ _OWN = {
     "sim/optics/simulate.py", "replay/command.py", "review/viewer/command.py",
     "review/runs.py", "calibration/session.py", "calibration/camera.py",
     "calibration/sets.py", "calibration/report.py", "geometry/spread_file.py", "commissioning/devices.py",
-    # the project's own pages
+    "commissioning/new_driver.py",
     # shared memory
     "processes/frames.py", "processes/ring.py",
     # into memory, and from there by `model.files`

@@ -555,15 +555,6 @@ def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
     assert "worse: " in against(now, next(row for row in rows if row.name == "present"))
 
 
-def test_candidates_of_earlier_versions_can_be_read(done: SessionFolder) -> None:
-    path = done.file("proposal.json")
-    kept = json.loads(path.read_text())
-    for row in kept["candidates"]:
-        del row["sigma"]
-    path.write_text(json.dumps(kept))
-    assert session.offered(done)[1].sigma is None
-
-
 def test_margins_of_what_is_kept(done: SessionFolder) -> None:
     gains = load_gains(done.file("gains.toml"))
     found = margins(Gains.of(gains.loop), gains.plant.model, 0.02)
