@@ -190,14 +190,15 @@ def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
     assert [(line["kind"], line["name"]) for line in first.told] == [("maintenance", "pump_resonance")]
     (driven,) = first.alarmed("pump_resonance")
     assert "the pump's strokes, 48.1 Hz, drive the mirror's vibration at 48." in driven
-    assert [line["message"] for line in report_of(first.folder, capsys)] == [driven]
+    (reported,) = report_of(first.folder, capsys)
+    assert driven == f"Maintenance pump_resonance: {reported['message']}"
     second = Hold(tmp_path, 7.0, stack)
     minutes(second, 0.0, 3, 48.0 * 1.01)
     second.end()
     (moved,) = second.told
     assert (moved["kind"], moved["name"]) == ("maintenance", "film_tension")
     assert "moved by +1.0% within 168 h: the film's tension by +2.0%; check clamping" in moved["message"]
-    assert second.alarmed("film_tension") == [moved["message"]]
+    assert second.alarmed("film_tension") == [f"Maintenance film_tension: {moved['message']}"]
     assert [line["message"] for line in report_of(second.folder, capsys)] == [moved["message"]]
     before, after = (hold.timeline() for hold in (first, second))
     assert (len(before[0]), len(after[0])) == (5, 3)
