@@ -22,6 +22,7 @@ from benchmarks.page import page
 NAMES = (
     "hold_live",
     "ticks",
+    "snapshots",
     "viewers",
     "live_cycle",
     "tracking",

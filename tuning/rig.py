@@ -55,7 +55,8 @@ class Rig:
 
     def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
         """Run an experiment about 0 until it finishes; the loop can hold afterwards."""
-        return self._run(trial.Trial(spec, self._config, self._pump, 0.0), spec.holding_flow_um_per_s)
+        begun = trial.begin_trial(spec, self._config, self._pump, 0.0)
+        return self._run(trial.Trial(begun, self._config.rate_hz), spec.holding_flow_um_per_s)
 
     def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
         flows: list[float] = []

@@ -1,5 +1,6 @@
 """The acquisition's resources, opened and closed around its loop."""
 
+import json
 import signal
 import time
 from collections.abc import Callable
@@ -15,10 +16,11 @@ from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology import live, phase
 from membrane_ctrl.metrology.track.live import Heard, LiveTracker, Stethoscope
-from membrane_ctrl.model import files, object_codec, plain_json
+from membrane_ctrl.model import files, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
+from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.run_files import run_folder
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
@@ -196,7 +198,7 @@ def listener(config: Config, clock: RunClock, run_dir: Path | None) -> Callable[
         told = stethoscope.after(estimate)
         if told and run_dir is not None:
             with suppress(OSError):  # a full disk: the recorder says so
-                text = plain_json.dumps_checked(object_codec.encode(stethoscope.heard, {}))
+                text = plain_json.dumps_checked(json.loads(encode_state(stethoscope.heard)))
                 files.write_text_atomic(run_dir / _HEARD, text + "\n")
         return told
 
@@ -211,8 +213,8 @@ def _heard_before(config: Config, run_dir: Path) -> Heard | None:
         with suppress(OSError, ValueError, RecursionError):  # damaged: take an older one
             table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
             if isinstance(table, dict) and plain_json.take_checksum(table):
-                heard: Heard = object_codec.Decoder((Heard(),), {}).decode(table, Heard)
-                return heard if run == run_dir else replace(heard, said=set())  # those were another run's
+                heard = decode_state(json.dumps(table).encode(), Heard, _HEARD_BYTES_MAX)
+                return heard if run == run_dir else replace(heard, said=[])  # those were another run's
     return None
 
 

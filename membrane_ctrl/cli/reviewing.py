@@ -205,6 +205,9 @@ def replay(
     start: FromOption = None,
     end: ToOption = None,
     to_test: Annotated[str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")] = None,
+    state: Annotated[
+        bool, typer.Option("--state", help="Print what the controller remembers at the end of the part.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Replay a run's inputs through today's control code and report differences (exit 3)."""
@@ -215,7 +218,7 @@ def replay(
     with _files_of_the_run():
         folder = catalogue.resolve(run_dir)
         from_s, to_s = catalogue.part_s(open_run(folder).origin_utc, start, end)
-        return replay_command(folder, max(0.0, from_s), to_s, to_test, json)
+        return replay_command(folder, max(0.0, from_s), to_s, to_test, json, state)
 
 
 def repair(

@@ -11,15 +11,19 @@ late reading is exact, whenever it comes.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
+from membrane_ctrl.control import centre_estimate
 from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
 from membrane_ctrl.control.filters import LearnedFactor, Ramp, ReadingNoise, configured_walk, smoothing
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
 _GAS, _LEAK, _AMBIENT, _AIR, _WARMTH, _MOUNT, _STAND = range(7)
 _PLANT = 7  # states before the clones
@@ -41,25 +45,83 @@ _ONE: FloatArray = np.eye(_PLANT + CLONES)  # a reading's expectation is a sum o
 
 
 @dataclass(slots=True)
-class _Watch:
+class SensorWatch(StateNode):
     """What the filter knows of one sensor."""
 
     seen_s: float = -math.inf  # arrival of the last accepted reading
     taken_s: float = -math.inf  # when it was taken
     innovation: float = math.nan
     pull: float = 0.0  # recent sum of gains on the centre
-    far: int = 0  # readings in a row beyond the outer limit
+    far: Count = 0  # readings in a row beyond the outer limit
     far_since_s: float = math.nan
+
+
+_STATES = _PLANT + CLONES
+
+
+@dataclass(slots=True)
+class CentreOrigin(StateNode):
+    """The first values, less which the filter takes the later ones: numbers stay small."""
+
+    ambient_pressure_pa: float = math.nan
+    air_temperature_c: float = math.nan
+    sag_um: float = math.nan
+
+
+@dataclass(slots=True)
+class CentreState(StateNode):
+    """The filter's memory: the states, their covariance, and what was learned of the noise."""
+
+    x: Annotated[FloatArray, ArrayShape((_STATES,))] = field(default_factory=lambda: np.zeros(_STATES))
+    p: Annotated[FloatArray, ArrayShape((_STATES, _STATES))] = field(
+        default_factory=lambda: np.zeros((_STATES, _STATES))
+    )
+    # when each clone was made
+    times: Annotated[FloatArray, ArrayShape((CLONES,))] = field(default_factory=lambda: np.full(CLONES, -np.inf))
+    count: Count = 0  # ticks
+    origin: CentreOrigin = field(default_factory=CentreOrigin)
+    # by sensor
+    watches: Annotated[list[SensorWatch], Field(min_length=len(Sensor), max_length=len(Sensor))] = field(
+        default_factory=lambda: [SensorWatch() for _ in Sensor]
+    )
+    noises: Annotated[list[ReadingNoise], Field(min_length=len(Sensor), max_length=len(Sensor))] = field(
+        default_factory=lambda: [ReadingNoise.of_reading(stated=sensor == Sensor.OPTICS) for sensor in Sensor]
+    )
+    # of centre, pressure, air, and the laser's mount
+    walks: Annotated[list[LearnedFactor], Field(min_length=4, max_length=4)] = field(
+        default_factory=lambda: [configured_walk() for _ in range(4)]
+    )
+    # of laser and optics
+    ramps: Annotated[list[Ramp], Field(min_length=len(_RUN), max_length=len(_RUN))] = field(
+        default_factory=lambda: [Ramp() for _ in _RUN]
+    )
+    transit: centre_estimate.TransitState = field(default_factory=centre_estimate.TransitState)
+    frames: Count = 0  # of the optics since lock
+    frame_interval_s: float = FRESH_S[Sensor.OPTICS]
+    last_frame_s: float = -math.inf
 
 
 class CentreFilter:
     """Estimates the centre; `start` it, then call `step` on every tick."""
 
-    def __init__(self, config: EstimatorConfig, loop: LoopConfig) -> None:
+    def __init__(self, config: EstimatorConfig, loop: LoopConfig, memory: CentreState | None = None) -> None:
         self._config, self._rate_hz = config, loop.rate_hz
         self.set_gains(loop)
         self._every = max(1, round(_CLONE_S * loop.rate_hz))
-        self.start(0.0, 0.0, 0.0)
+        self.memory = memory or CentreState()
+        self._transit = self._make_transit()
+        self._judged = True
+        self._jumped: list[str] = []
+        self._jumped_sensors: list[Sensor] = []
+
+    def _make_transit(self) -> Transit:
+        config = self._config
+        return Transit(config.pump_delay_s, config.pump_lag_s, 1 / self._rate_hz, self.memory.transit)
+
+    @property
+    def frames(self) -> int:
+        """Frames of the optics since lock."""
+        return self.memory.frames
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take what barometer and thermometer mean for the centre."""
@@ -77,45 +139,35 @@ class CentreFilter:
 
         `sag_zero_um`: the sag at displacement 0, of a bench without a laser; otherwise the first frames lock it.
         """
-        config, rate_hz = self._config, self._rate_hz
-        self._x: FloatArray = np.zeros(_PLANT + CLONES)
-        self._p: FloatArray = np.zeros((_PLANT + CLONES, _PLANT + CLONES))
-        self._times: FloatArray = np.full(CLONES, -np.inf)
-        self._count = 0
-        self._x[_GAS], self._x[_LEAK], self._x[_MOUNT] = displacement_um - mount_um, flow_um_per_s, mount_um
+        config, memory = self._config, self.memory
+        memory.start_afresh()
+        memory.x[_GAS], memory.x[_LEAK], memory.x[_MOUNT] = displacement_um - mount_um, flow_um_per_s, mount_um
         variances = (
             config.laser_noise_um**2, _LEAK_STD_UM_PER_S**2, _AMBIENT_STD_PA**2, _WARMTH_STD_K**2, _WARMTH_STD_K**2,
             0.0, _UNKNOWN_UM2,
         )  # fmt: skip
         for i, variance in enumerate(variances):
-            self._p[i, i] = variance
-        self._origin = [math.nan, math.nan, math.nan]  # first pressure, air temperature, sag
-        self._watches = [_Watch() for _ in Sensor]
-        self._noises = [ReadingNoise(stated=sensor == Sensor.OPTICS) for sensor in Sensor]
-        self._walks = [configured_walk() for _ in range(4)]  # of centre, pressure, air, and the laser's mount
-        self._ramps = [Ramp(limit) for limit in _RUN]
-        self._transit = Transit(config.pump_delay_s, config.pump_lag_s, 1 / rate_hz)
+            memory.p[i, i] = variance
+        self._transit = self._make_transit()
         self._transit.place(flow_um_per_s)
-        self._jumped: list[str] = []
-        self._jumped_sensors: list[Sensor] = []
-        self._judged = True
-        self.frames = 0  # of the optics since lock
-        self._frame_interval_s = FRESH_S[Sensor.OPTICS]
-        self._last_frame_s = -math.inf
         if math.isfinite(sag_zero_um):
-            self._origin[2], self._p[_STAND, _STAND], self.frames = sag_zero_um, 0.0, LOCK_FRAMES
+            memory.origin.sag_um = sag_zero_um
+            memory.p[_STAND, _STAND] = 0.0
+            memory.frames = LOCK_FRAMES
 
     def relock(self) -> None:
         """Take the optics' next readings as a new zero."""
-        self._p[_STAND] = self._p[:, _STAND] = 0.0
-        self._p[_STAND, _STAND], self._x[_STAND] = _UNKNOWN_UM2, 0.0
-        self._origin[2] = math.nan
-        self.frames = 0
-        self._watches[Sensor.OPTICS] = _Watch()
+        memory = self.memory
+        memory.p[_STAND] = memory.p[:, _STAND] = 0.0
+        memory.p[_STAND, _STAND], memory.x[_STAND] = _UNKNOWN_UM2, 0.0
+        memory.origin.sag_um = math.nan
+        memory.frames = 0
+        memory.watches[Sensor.OPTICS] = SensorWatch()
 
     def blame_optics(self, mount_um: float) -> None:
         """The optics were wrong: what the mount has moved from there was the centre's motion. They lock anew."""
-        self._x += (self._x[_MOUNT] - mount_um) * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
+        x = self.memory.x
+        x += (x[_MOUNT] - mount_um) * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
         self.relock()
 
     def step(self, given: CentreReadings, dt_s: float) -> CentreEstimate:
@@ -123,15 +175,21 @@ class CentreFilter:
         self._jumped, self._jumped_sensors, self._judged = [], [], given.judged
         self._predict(given, dt_s)
         self._clone(given.now_s)
-        for watch in self._watches:
+        for watch in self.memory.watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
         pressure_pa, air_c = believed_weather(given.ambient_pressure_pa, given.air_temperature_c)
-        config = self._config
-        weather = (_AMBIENT, pressure_pa, config.barometer_noise_pa), (_AIR, air_c, config.thermometer_noise_k)
-        for n, (state, value, noise) in enumerate(weather):
-            if self._uses[n] and math.isfinite(value):
-                sensor = Sensor(Sensor.BAROMETER + n)
-                self._take(sensor, _ONE[state], self._from_origin(n, value), noise**2, given.now_s)
+        config, origin = self._config, self.memory.origin
+        uses_pressure, uses_air = self._uses
+        if uses_pressure and math.isfinite(pressure_pa):
+            if math.isnan(origin.ambient_pressure_pa):
+                origin.ambient_pressure_pa = pressure_pa
+            change_pa, variance = pressure_pa - origin.ambient_pressure_pa, config.barometer_noise_pa**2
+            self._take(Sensor.BAROMETER, _ONE[_AMBIENT], change_pa, variance, given.now_s)
+        if uses_air and math.isfinite(air_c):
+            if math.isnan(origin.air_temperature_c):
+                origin.air_temperature_c = air_c
+            change_k, variance = air_c - origin.air_temperature_c, config.thermometer_noise_k**2
+            self._take(Sensor.THERMOMETER, _ONE[_AIR], change_k, variance, given.now_s)
         if math.isfinite(given.sag_um) and 0.0 <= given.sag_sigma_um < _IMPOSSIBLE:
             self._take_frame(given)
         if math.isfinite(given.laser_um):
@@ -139,14 +197,8 @@ class CentreFilter:
             self._take(Sensor.LASER, row, given.laser_um, config.laser_noise_um**2, given.now_s)
         return self._estimate(given.now_s)
 
-    def _from_origin(self, which: int, value: float) -> float:
-        """The value less the first one: numbers stay small."""
-        if math.isnan(self._origin[which]):
-            self._origin[which] = value
-        return value - self._origin[which]
-
     def _predict(self, given: CentreReadings, dt_s: float) -> None:
-        x, p, config = self._x, self._p, self._config
+        x, p, config = self.memory.x, self.memory.p, self._config
         follow = smoothing(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
@@ -158,23 +210,25 @@ class CentreFilter:
         p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
         p[_AIR, _AIR] += dt_s * self._air_walk()
         # without optics no reading tells mount from film, and what was learned of a drift would let the film drift
-        drifts = self._walks[3].factor if self._fresh(Sensor.OPTICS, given.now_s) else 1.0
+        drifts = self.memory.walks[3].factor if self._fresh(Sensor.OPTICS, given.now_s) else 1.0
         p[_MOUNT, _MOUNT] += dt_s * drifts * config.mount_walk_um_per_root_s**2
 
     def _clone(self, now_s: float) -> None:
         """Remember the centre of this tick in the oldest clone."""
-        self._count += 1
-        if self._count % self._every:
+        memory = self.memory
+        memory.count += 1
+        if memory.count % self._every:
             return
-        slot = self._count // self._every % CLONES
-        self._times[slot] = now_s
+        slot = memory.count // self._every % CLONES
+        memory.times[slot] = now_s
         slot += _PLANT
-        self._p[slot] = self._p[:, slot] = self._centre @ self._p
-        self._p[slot, slot] = self._centre @ self._p[slot]
-        self._x[slot] = self._centre @ self._x
+        memory.p[slot] = memory.p[:, slot] = self._centre @ memory.p
+        memory.p[slot, slot] = self._centre @ memory.p[slot]
+        memory.x[slot] = self._centre @ memory.x
 
     def _take_frame(self, given: CentreReadings) -> None:
-        times, time_s = self._times, given.sag_time_s
+        memory = self.memory
+        times, time_s = memory.times, given.sag_time_s
         before, after = np.where(times <= time_s, times, -np.inf), np.where(times > time_s, times, np.inf)
         early, late = int(before.argmax()), int(after.argmin())
         if not math.isfinite(before[early]) or time_s > given.now_s:
@@ -184,13 +238,16 @@ class CentreFilter:
             share = float((time_s - times[early]) / (times[late] - times[early]))
             row += share * (_ONE[_PLANT + late] - _ONE[_PLANT + early])
         variance = given.sag_sigma_um**2 + self._config.optics_noise_um**2
-        self._take(Sensor.OPTICS, row, self._from_origin(2, given.sag_um), variance, given.now_s, time_s)
-        if (interval_s := time_s - self._last_frame_s) > 0:
-            longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - self._frame_interval_s
-            self._frame_interval_s += _INTERVAL_SHARE * longer_s
-        self._last_frame_s = time_s
-        self.frames += 1
-        if self.frames == LOCK_FRAMES:
+        if math.isnan(memory.origin.sag_um):
+            memory.origin.sag_um = given.sag_um
+        change_um = given.sag_um - memory.origin.sag_um
+        self._take(Sensor.OPTICS, row, change_um, variance, given.now_s, time_s)
+        if (interval_s := time_s - memory.last_frame_s) > 0:
+            longer_s = min(interval_s, FRESH_S[Sensor.OPTICS]) - memory.frame_interval_s
+            memory.frame_interval_s += _INTERVAL_SHARE * longer_s
+        memory.last_frame_s = time_s
+        memory.frames += 1
+        if memory.frames == LOCK_FRAMES:
             self._lock()
 
     def _lock(self) -> None:
@@ -199,7 +256,7 @@ class CentreFilter:
         A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's displacement
         mount + e.
         """
-        for matrix in (self._p, self._p.T):
+        for matrix in (self.memory.p, self.memory.p.T):
             matrix[_GAS] -= matrix[_STAND]
             matrix[_MOUNT] += matrix[_STAND]
             matrix[_PLANT:] -= matrix[_STAND]
@@ -210,8 +267,9 @@ class CentreFilter:
     ) -> None:
         """Use one reading, whose expectation is a row times the states, by how well it fits."""
         taken_s = now_s if math.isnan(taken_s) else taken_s
-        watch, x, p = self._watches[sensor], self._x, self._p
-        variance *= self._noises[sensor].factor
+        memory = self.memory
+        watch, x, p = memory.watches[sensor], memory.x, memory.p
+        variance *= memory.noises[sensor].factor
         innovation = float(value - row @ x)
         if abs(innovation) > _IMPOSSIBLE:
             return
@@ -219,8 +277,8 @@ class CentreFilter:
         squared = innovation**2 / spread
         watch.innovation = innovation / math.sqrt(spread)
         leads = sensor != Sensor.LASER or not self._fresh(Sensor.OPTICS, now_s)
-        ramp = self._ramps[sensor] if leads and sensor <= Sensor.OPTICS else None
-        runs = ramp is not None and ramp.update(watch.innovation, taken_s)
+        ramp = memory.ramps[sensor] if leads and sensor <= Sensor.OPTICS else None
+        runs = ramp is not None and ramp.update(watch.innovation, taken_s, _RUN[sensor])
         if self._doubted(sensor, squared, taken_s, now_s) and not runs:
             return
         if watch.far >= _FAR_COUNT:
@@ -245,28 +303,28 @@ class CentreFilter:
         """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
         walks: tuple[tuple[LearnedFactor, float], ...] = ()
         if sensor > Sensor.OPTICS:
-            walks = ((self._walks[sensor - 1], 1.0),)
+            walks = ((self.memory.walks[sensor - 1], 1.0),)
         elif leads:
             by_air = self._air_walk() * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
             own = (centre := self._centre_walk()) / (centre + by_air)
-            walks = ((self._walks[0], own), (self._walks[2], 1 - own))
+            walks = ((self.memory.walks[0], own), (self.memory.walks[2], 1 - own))
         else:  # a laser beside the optics shows its mount: drift that is not its walk would count as its noise
-            walks = ((self._walks[3], 1.0),)
-        self._noises[sensor].learn(self._watches[sensor].innovation, share, dt_s, walks)
+            walks = ((self.memory.walks[3], 1.0),)
+        self.memory.noises[sensor].learn(self.memory.watches[sensor].innovation, share, dt_s, walks)
 
     def _pressure_walk(self) -> float:
-        return self._walks[1].factor * self._config.pressure_walk_pa_per_root_s**2
+        return self.memory.walks[1].factor * self._config.pressure_walk_pa_per_root_s**2
 
     def _air_walk(self) -> float:
-        return self._walks[2].factor * self._config.air_walk_k_per_root_s**2
+        return self.memory.walks[2].factor * self._config.air_walk_k_per_root_s**2
 
     def _centre_walk(self) -> float:
         missed = _GAIN_ERROR**2 * self._pressure_gain**2 * self._pressure_walk()
-        return self._walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
+        return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
     def _spread(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
         """Covariance of all states with a reading's expectation, and the variance of its innovation."""
-        ph: FloatArray = self._p @ row
+        ph: FloatArray = self.memory.p @ row
         return ph, float(row @ ph) + variance
 
     def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
@@ -274,18 +332,18 @@ class CentreFilter:
 
         A laser far off waits for a frame that shows whether film or mount has moved.
         """
-        watch = self._watches[sensor]
+        watch = self.memory.watches[sensor]
         if squared <= _FAR2:
             watch.far = 0
             return False
         watch.far_since_s = watch.far_since_s if watch.far else taken_s
         watch.far += 1
         waits = sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s)
-        return watch.far < _FAR_COUNT or (waits and self._watches[Sensor.OPTICS].taken_s <= watch.far_since_s)
+        return watch.far < _FAR_COUNT or (waits and self.memory.watches[Sensor.OPTICS].taken_s <= watch.far_since_s)
 
     def _open(self, sensor: Sensor, innovation: float, now_s: float) -> None:
         """A sensor has moved and stays there: let the others say whether it moved, or what it sees."""
-        since_s = self._watches[sensor].far_since_s
+        since_s = self.memory.watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
         self._jumped_sensors.append(sensor)
         moved = _ONE[_GAS] + self._centre_since(since_s)
@@ -307,34 +365,34 @@ class CentreFilter:
                 self._widen(_OPTICS_JUMP_SHARE * innovation * _ONE[_STAND])
 
     def _laser_agrees(self, now_s: float) -> bool:
-        return self._fresh(Sensor.LASER, now_s) and not self._watches[Sensor.LASER].far
+        return self._fresh(Sensor.LASER, now_s) and not self.memory.watches[Sensor.LASER].far
 
     def _centre_since(self, since_s: float) -> FloatArray:
-        return np.concatenate([np.zeros(_PLANT), self._times >= since_s])
+        return np.concatenate([np.zeros(_PLANT), self.memory.times >= since_s])
 
     def _widen(self, jump: FloatArray) -> None:
         """The states may have jumped by some such amounts."""
-        self._p += jump[:, None] * jump
+        self.memory.p += jump[:, None] * jump
 
     def _widen_leak(self, ramp: Ramp, now_s: float, sigma_um: float) -> None:
         """The leak may have changed when the innovations began to run away."""
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
-        jump[_PLANT:] = np.maximum(self._times - ramp.since_s, 0.0)
+        jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)
         self._widen(ramp.slope * sigma_um * jump)
 
     def _fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
         if sensor == Sensor.OPTICS:
-            limit_s = min(limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self._frame_interval_s))
-        return now_s - self._watches[sensor].seen_s <= limit_s
+            limit_s = min(limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self.memory.frame_interval_s))
+        return now_s - self.memory.watches[sensor].seen_s <= limit_s
 
     def _estimate(self, now_s: float) -> CentreEstimate:
-        x = self._x
+        x = self.memory.x
         drift = float(x[_LEAK])
         if self._gas_follows_air_s > 0:
             drift -= float(self._warmth_gain * (x[_AIR] - x[_WARMTH]) / self._gas_follows_air_s)
         um = float(self._centre @ x + x[_MOUNT])
-        pulls = sum(watch.pull for watch in self._watches)
+        pulls = sum(watch.pull for watch in self.memory.watches)
         return CentreEstimate(
             um=um,
             sigma_um=math.sqrt(max(0.0, self._spread(self._centre, 0.0)[1])),
@@ -345,7 +403,7 @@ class CentreFilter:
             drift_um_per_s=drift,
             sensors=tuple(
                 SensorView(self._fresh(sensor, now_s), watch.innovation, watch.pull / pulls if pulls > 0 else 0.0)
-                for sensor, watch in zip(Sensor, self._watches, strict=True)
+                for sensor, watch in zip(Sensor, self.memory.watches, strict=True)
             ),
             jumped=tuple(self._jumped),
             jumped_sensors=tuple(self._jumped_sensors),

@@ -14,6 +14,7 @@ from enum import IntEnum
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
 from membrane_ctrl.control.filters import LowPass, smoothing
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # 0.5 Pa of noise per sample are then 0.7 um at 10 Hz and 2.3 um at 1 Hz
 SMOOTH_S = 10.0
@@ -60,53 +61,64 @@ def _known(seen_s: float, readings: int) -> bool:
 
 
 @dataclass(slots=True)
+class SinceState(StateNode):
+    """A reference of laser, trim and gauge that follows slowly while laser and gauge agree."""
+
+    laser_um: float = math.nan
+    trim_um: float = 0.0
+    root: float = math.nan  # cube root of the gauge pressure
+    share: float = 0.0  # of what may be between them
+
+
+@dataclass(frozen=True, slots=True)
 class _Since:
-    """Changes of sag against a reference that follows slowly while laser and gauge agree."""
+    """Compares changes of sag against such a reference."""
 
     sensor: str  # of the displacement
     follow_s: float
     limit_um: float
-    laser_um: float = math.nan
-    trim_um: float = 0.0
-    root: float = math.nan
-    share: float = 0.0  # of what may be between them
 
-    def apart(self, laser_um: float, trim_um: float, root: float, sag_um: float, dt_s: float) -> str:
+    def apart(
+        self, memory: SinceState, laser_um: float, trim_um: float, root: float, sag_um: float, dt_s: float
+    ) -> str:
         """Both readings, if they contradict each other; `root` is the cube root of the gauge pressure."""
-        if math.isnan(self.laser_um):
-            self.laser_um, self.trim_um, self.root = laser_um, trim_um, root
-        by_laser_um, trimmed_um = laser_um - self.laser_um, trim_um - self.trim_um
-        by_gauge_um = (sag_um - by_laser_um) * (root / self.root - 1)
+        if math.isnan(memory.laser_um):
+            memory.laser_um = laser_um
+            memory.trim_um = trim_um
+            memory.root = root
+        by_laser_um, trimmed_um = laser_um - memory.laser_um, trim_um - memory.trim_um
+        by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
         # A laser drift that the shape loop has compensated has not moved the film.
         apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
-        self.share = apart_um / (self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)))
-        if self.share > 1.0:
+        memory.share = apart_um / (self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)))
+        if memory.share > 1.0:
             return f"{self.sensor} {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
         share = smoothing(dt_s, self.follow_s)
-        self.laser_um += share * by_laser_um
-        self.trim_um += share * trimmed_um
-        self.root += share * (root - self.root)
+        memory.laser_um += share * by_laser_um
+        memory.trim_um += share * trimmed_um
+        memory.root += share * (root - memory.root)
         return ""
 
 
 @dataclass(slots=True)
-class LeakGrowth:
+class LeakGrowth(StateNode):
     """Whether the film takes far more gas than it used to."""
 
-    _usual: LowPass = field(default_factory=lambda: LowPass(LEAK_REFERENCE_S))
-    _flow: LowPass = field(default_factory=lambda: LowPass(FLOW_MEAN_S))
-    _still_s: float = 0.0
-    _stands_s: float = 0.0
+    usual: LowPass = field(default_factory=LowPass)
+    flow: LowPass = field(default_factory=LowPass)
+    still_s: float = 0.0
+    stands_s: float = 0.0
 
     def reset(self) -> None:
         """Forget the usual consumption."""
-        self._usual.reset(math.nan)
-        self._flow.reset(math.nan)
+        self.usual.reset(math.nan)
+        self.flow.reset(math.nan)
         self.moves()
 
     def moves(self) -> None:
         """The setpoint ramps: the mean includes the ramp's gas, with the error of the pump's map."""
-        self._still_s = self._stands_s = 0.0
+        self.still_s = 0.0
+        self.stands_s = 0.0
 
     def step(self, leak_um_per_s: float, flow_um_per_s: float, most: float, dt_s: float) -> str:
         """Process one tick of a held mirror and return any problem. NaN for unknown values.
@@ -117,23 +129,39 @@ class LeakGrowth:
         """
         if not (math.isfinite(leak_um_per_s) and math.isfinite(flow_um_per_s)):
             return ""
-        flow_um_per_s = self._flow.update(flow_um_per_s, dt_s)
+        flow_um_per_s = self.flow.update(flow_um_per_s, dt_s, FLOW_MEAN_S)
         takes_um_per_s = min(leak_um_per_s, flow_um_per_s)
-        self._still_s += dt_s
-        if self._still_s < LEAK_STANDS_S:
+        self.still_s += dt_s
+        if self.still_s < LEAK_STANDS_S:
             return ""
-        usual_um_per_s = max(self._usual.value, 0.0)
+        usual_um_per_s = max(self.usual.value, 0.0)
         excess_um_per_s = (most - 1) * max(usual_um_per_s, LEAK_LEAST_UM_PER_S)
         if not takes_um_per_s > usual_um_per_s + excess_um_per_s:
-            self._stands_s = 0.0
+            self.stands_s = 0.0
             # the larger of the two, as a faulty thermometer may shift the estimate down for long
-            known = math.isfinite(self._usual.value)
-            self._usual.update(max(leak_um_per_s, flow_um_per_s) if known else leak_um_per_s, dt_s)
+            known = math.isfinite(self.usual.value)
+            takes_um_per_s = max(leak_um_per_s, flow_um_per_s) if known else leak_um_per_s
+            self.usual.update(takes_um_per_s, dt_s, LEAK_REFERENCE_S)
             return ""
-        self._stands_s += dt_s
-        if self._stands_s < LEAK_STANDS_S:
+        self.stands_s += dt_s
+        if self.stands_s < LEAK_STANDS_S:
             return ""
         return f"the film takes {takes_um_per_s:.1f} um/s of gas; it used to take {usual_um_per_s:.1f} um/s"
+
+
+@dataclass(slots=True)
+class FilmMonitorState(StateNode):
+    """Means of one displacement, trim and gauge, and the references that they are compared with."""
+
+    laser: LowPass = field(default_factory=LowPass.with_early_mean)
+    trim: LowPass = field(default_factory=LowPass.with_early_mean)
+    root: LowPass = field(default_factory=LowPass.with_early_mean)  # of the cube root of the gauge pressure
+    seen_s: float = 0.0
+    readings: Count = 0
+    minutes: SinceState = field(default_factory=SinceState)
+    hour: SinceState = field(default_factory=SinceState)
+    day: SinceState = field(default_factory=SinceState)
+    drifting: bool = False  # sensor and gauge have moved apart over hours, as by climate or a slow drift
 
 
 class FilmMonitor:
@@ -145,27 +173,26 @@ class FilmMonitor:
     mirror : MirrorConfig
     sensor : str
         The displacement's sensor, for the message.
-
-    Attributes
-    ----------
-    drifting : bool
-        Sensor and gauge have moved apart over hours, as by climate or a slow drift.
+    memory : FilmMonitorState, optional
     """
 
-    def __init__(self, limits: LimitsConfig, mirror: MirrorConfig, sensor: str = "laser") -> None:
-        self._sensor = sensor
+    def __init__(
+        self,
+        limits: LimitsConfig,
+        mirror: MirrorConfig,
+        sensor: str = "laser",
+        memory: FilmMonitorState | None = None,
+    ) -> None:
+        self.memory = memory or FilmMonitorState()
         self._limits = limits
         self._sag_um, self._pressure_pa = 1e3 * mirror.sag_mm, mirror.pressure_pa
-        self.reset()
+        self._minutes = _Since(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
+        self._hour = _Since(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
+        self._day = _Since(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)
 
     def reset(self) -> None:
         """Forget everything."""
-        self.drifting = False
-        self._laser, self._trim, self._root = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
-        self._seen_s, self._readings = 0.0, 0
-        self._minutes = _Since(self._sensor, SINCE_MINUTES_S, self._limits.laser_gauge_apart_max_um)
-        self._hour = _Since(self._sensor, SINCE_HOUR_S, self._limits.laser_gauge_drift_max_um)
-        self._day = _Since(self._sensor, SINCE_DAY_S, self._limits.laser_gauge_day_max_um)
+        self.memory.start_afresh()
 
     def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
         """Process one tick and return both readings if they contradict each other. NaN without a good reading.
@@ -175,39 +202,45 @@ class FilmMonitor:
         # Both or none: two means that started together do not differ because of the film's motion.
         if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):
             return ""
-        laser_um = self._laser.update(laser_um, dt_s)
-        trim_um = self._trim.update(trim_um, dt_s)  # a knock that the optics have found moves both alike
+        memory = self.memory
+        laser_um = memory.laser.update(laser_um, dt_s, SMOOTH_S)
+        trim_um = memory.trim.update(trim_um, dt_s, SMOOTH_S)  # a knock that the optics have found moves both alike
         # The mean of the root always follows the mean of the sag; the mean of the pressure does not.
-        root = self._root.update(math.cbrt(gauge_pressure_pa), dt_s)
-        self._seen_s, self._readings = self._seen_s + dt_s, self._readings + 1
+        root = memory.root.update(math.cbrt(gauge_pressure_pa), dt_s, SMOOTH_S)
+        memory.seen_s += dt_s
+        memory.readings += 1
         if strange := self._not_nominal(laser_um, root**3):
             return strange
         sag_um = self._sag_um + laser_um
-        if not _known(self._seen_s, self._readings) or not (self._taut or root**3 > TAUT_PA):
+        if not _known(memory.seen_s, memory.readings) or not (self._taut or root**3 > TAUT_PA):
             return ""
-        contradictions = [
-            since.apart(laser_um, trim_um, root, sag_um, dt_s) for since in (self._minutes, self._hour, self._day)
-        ]
-        self.drifting = self._day.share > (DRIFTING_OVER_SHARE if self.drifting else DRIFTING_SHARE)
+        spans = ((self._minutes, memory.minutes), (self._hour, memory.hour), (self._day, memory.day))
+        contradictions = [since.apart(kept, laser_um, trim_um, root, sag_um, dt_s) for since, kept in spans]
+        memory.drifting = memory.day.share > (DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE)
         return next(filter(None, contradictions), "")
+
+    @property
+    def drifting(self) -> bool:
+        """Sensor and gauge have moved apart over hours, as by climate or a slow drift."""
+        return self.memory.drifting
 
     @property
     def doubted(self) -> bool:
         """Laser and gauge are further apart than by noise or drift, though within the limit."""
-        return self._minutes.share > _DOUBTED_SHARE
+        return self.memory.minutes.share > _DOUBTED_SHARE
 
     @property
     def drift_um(self) -> float:
         """How far sensor and gauge have moved apart within a day, um; 0 without a reference."""
-        return self._day.share * self._limits.laser_gauge_day_max_um
+        return self.memory.day.share * self._limits.laser_gauge_day_max_um
 
     @property
     def _taut(self) -> bool:
         """There is a reference: from now on, a gauge that falls to zero does not mean a slack film."""
-        return math.isfinite(self._minutes.root)
+        return math.isfinite(self.memory.minutes.root)
 
     def _not_nominal(self, laser_um: float, gauge_pa: float) -> str:
-        if self._pressure_pa == 0.0 or self._seen_s < NOMINAL_S:
+        if self._pressure_pa == 0.0 or self.memory.seen_s < NOMINAL_S:
             return ""
         wanted_pa = self._pressure_pa * max(1 + laser_um / self._sag_um, 0.0) ** 3
         if wanted_pa / NOMINAL_FACTOR - NOMINAL_SLACK_PA <= gauge_pa <= NOMINAL_FACTOR * wanted_pa + NOMINAL_SLACK_PA:
@@ -250,7 +283,7 @@ class Liar(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Changes:
+class Changes(StateNode):
     """Changes of sag since the reference, as seen by the three, um."""
 
     laser_um: float
@@ -272,12 +305,9 @@ class Changes:
 
 
 @dataclass(slots=True)
-class _Reference:
+class ReferenceMeans(StateNode):
     """Means of laser, optics and gauge that follow the present ones while laser and optics agree."""
 
-    sag_um: float  # of the mirror at displacement 0
-    follow_s: float
-    limit_um: float
     laser_um: float = math.nan
     optics_um: float = math.nan
     gauge_pa: float = math.nan
@@ -291,17 +321,39 @@ class _Reference:
         """Place it at the present means of laser (um), optics (um) and gauge (Pa)."""
         self.laser_um, self.optics_um, self.gauge_pa = means
 
-    def follow(self, means: tuple[float, float, float], dt_s: float) -> None:
+    def follow(self, means: tuple[float, float, float], dt_s: float, time_constant_s: float) -> None:
         """Move it towards the present means."""
-        share = smoothing(dt_s, self.follow_s)
+        share = smoothing(dt_s, time_constant_s)
         self.laser_um += share * (means[0] - self.laser_um)
         self.optics_um += share * (means[1] - self.optics_um)
         self.gauge_pa += share * (means[2] - self.gauge_pa)
 
-    def changes(self, means: tuple[float, float, float]) -> Changes:
-        """Changes of sag since the reference; the gauge's by Hencky's law: the sag goes with the cube root."""
-        gauge_um = (self.sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
+    def changes(self, means: tuple[float, float, float], sag_um: float) -> Changes:
+        """Changes of sag since the reference; the gauge's by Hencky's law: the sag goes with the cube root.
+
+        `sag_um` is that of the mirror at displacement 0.
+        """
+        gauge_um = (sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
         return Changes(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)
+
+
+@dataclass(slots=True)
+class PlausibilityState(StateNode):
+    """Means of laser, gauge and optics, the references that they are compared with, and the verdict."""
+
+    laser: LowPass = field(default_factory=LowPass.with_early_mean)
+    gauge: LowPass = field(default_factory=LowPass.with_early_mean)
+    optics: LowPass = field(default_factory=LowPass.with_early_mean)
+    fast: ReferenceMeans = field(default_factory=ReferenceMeans)
+    slow: ReferenceMeans = field(default_factory=ReferenceMeans)
+    speed_um_per_s: LowPass = field(default_factory=LowPass)
+    age_s: float = 0.0
+    readings: Count = 0
+    figure_s: float = math.nan
+    laser_gap_s: float = 0.0
+    slow_wrong: bool = False  # the verdict is the slow reference's
+    liar: Liar = Liar.NOBODY
+    changes: Changes = Changes(math.nan, math.nan, math.nan)
 
 
 class PlausibilityCheck:
@@ -318,49 +370,59 @@ class PlausibilityCheck:
         Of the mirror at displacement 0, by which a change of pressure is a change of sag.
     figure_lag_s : float
         By how much a figure may be older than the laser's reading of the same tick.
+    memory : PlausibilityState, optional
     """
 
-    def __init__(self, limit_um: float, sag_um: float, figure_lag_s: float = 0.0) -> None:
+    def __init__(
+        self, limit_um: float, sag_um: float, figure_lag_s: float = 0.0, memory: PlausibilityState | None = None
+    ) -> None:
         self._limit_um, self._sag_um, self._figure_lag_s = limit_um, sag_um, figure_lag_s
-        self.reset()
+        self._slow_limit_um = SLOW_SHARE * limit_um
+        self.memory = memory or PlausibilityState()
+
+    @property
+    def liar(self) -> Liar:
+        """The verdict."""
+        return self.memory.liar
+
+    @property
+    def changes(self) -> Changes:
+        """Changes of sag by which it was reached."""
+        return self.memory.changes
 
     def reset(self) -> None:
         """Forget everything: the mirror is not held."""
-        self._laser, self._gauge, self._optics = (LowPass(SMOOTH_S, early_mean=True) for _ in range(3))
-        self._fast = _Reference(self._sag_um, REFERENCE_S, self._limit_um)
-        self._slow = _Reference(self._sag_um, SLOW_REFERENCE_S, SLOW_SHARE * self._limit_um)
-        self._speed_um_per_s = LowPass(SPEED_S)
-        self._age_s, self._readings = 0.0, 0
-        self._figure_s = math.nan
-        self._laser_gap_s = 0.0
-        self._slow_wrong = False  # the verdict is the slow reference's
-        self.liar = Liar.NOBODY
-        self.changes = Changes(math.nan, math.nan, math.nan)
+        self.memory.start_afresh()
 
     def rebase(self) -> None:
         """Compare from the present means on: the sensor that was found wrong is used again in its new place."""
-        means = (self._laser.value, self._optics.value, self._gauge.value)
+        memory = self.memory
+        means = (memory.laser.value, memory.optics.value, memory.gauge.value)
         if not all(map(math.isfinite, means)):
             self.reset()
             return
-        self._fast.begin(means)
-        self._slow.begin(means)
-        self.liar, self._slow_wrong = Liar.NOBODY, False
+        memory.fast.begin(means)
+        memory.slow.begin(means)
+        self._clear_verdict()
+
+    def _clear_verdict(self) -> None:
+        self.memory.liar = Liar.NOBODY
+        self.memory.slow_wrong = False
 
     @property
     def watching(self) -> bool:
         """Whether it has had readings since the last `reset`."""
-        return math.isfinite(self._laser.value)
+        return math.isfinite(self.memory.laser.value)
 
     @property
     def judges(self) -> bool:
         """Whether it would tell a moved laser from a moved film."""
-        return self._fast.known
+        return self.memory.fast.known
 
     @property
     def slow_wrong(self) -> bool:
         """Whether the verdict is on a slow drift: what the sensor showed is wrong since a quarter of an hour."""
-        return self._slow_wrong
+        return self.memory.slow_wrong
 
     def step(
         self,
@@ -374,65 +436,76 @@ class PlausibilityCheck:
 
         `blind`: the last one is old. A camera that saw nothing of what moved is not accused of it.
         """
+        memory = self.memory
         self._take_laser(displacement_um, dt_s)
         if math.isfinite(gauge_pa):
-            self._gauge.update(gauge_pa, dt_s)
+            memory.gauge.update(gauge_pa, dt_s, SMOOTH_S)
         if estimate is not None and estimate.verdict != "rejected" and math.isfinite(estimate.sag_um):
-            since_s = 0.0 if math.isnan(self._figure_s) else estimate.time_s - self._figure_s
-            self._optics.update(estimate.sag_um, max(since_s, 0.0))
-            self._figure_s = estimate.time_s
-        means = (self._laser.value, self._optics.value, self._gauge.value)
-        laser_present = self._laser_gap_s <= LASER_GAP_S
+            since_s = 0.0 if math.isnan(memory.figure_s) else estimate.time_s - memory.figure_s
+            memory.optics.update(estimate.sag_um, max(since_s, 0.0), SMOOTH_S)
+            memory.figure_s = estimate.time_s
+        means = (memory.laser.value, memory.optics.value, memory.gauge.value)
+        laser_present = memory.laser_gap_s <= LASER_GAP_S
         if laser_present and not blind and all(map(math.isfinite, means)):
-            self._age_s, self._readings = self._age_s + dt_s, self._readings + 1
+            memory.age_s += dt_s
+            memory.readings += 1
             self._judge(means, dt_s)
-        return self.liar
+        return memory.liar
 
     def _take_laser(self, displacement_um: float, dt_s: float) -> None:
         """Update the laser's mean; after a gap it begins with the first reading, for the film may have moved."""
+        memory = self.memory
         if not math.isfinite(displacement_um):
-            self._laser_gap_s += dt_s
+            memory.laser_gap_s += dt_s
             return
-        if self._laser_gap_s > LASER_GAP_S:
-            self._laser = LowPass(SMOOTH_S, early_mean=True)
-        self._laser_gap_s = 0.0
-        mean_um = self._laser.update(displacement_um, dt_s)
-        self._speed_um_per_s.update((displacement_um - mean_um) / SMOOTH_S, dt_s)
+        if memory.laser_gap_s > LASER_GAP_S:
+            memory.laser = LowPass.with_early_mean()
+        memory.laser_gap_s = 0.0
+        mean_um = memory.laser.update(displacement_um, dt_s, SMOOTH_S)
+        memory.speed_um_per_s.update((displacement_um - mean_um) / SMOOTH_S, dt_s, SPEED_S)
 
     @property
     def _lag_um(self) -> float:
         """By how much optics may lag behind the laser because the film moves."""
-        return self._figure_lag_s * abs(self._speed_um_per_s.value)
+        return self._figure_lag_s * abs(self.memory.speed_um_per_s.value)
 
     def _judge(self, means: tuple[float, float, float], dt_s: float) -> None:
-        if not _known(self._age_s, self._readings):
+        memory = self.memory
+        if not _known(memory.age_s, memory.readings):
             return
-        for reference in (self._fast, self._slow):
+        for reference in (memory.fast, memory.slow):
             if not reference.known:
                 reference.begin(means)
-        if self.liar in (Liar.LASER, Liar.OPTICS):
+        if memory.liar in (Liar.LASER, Liar.OPTICS):
             # The verdict stands until the two clearly agree again: a drifting gauge must not accuse the other.
-            judged = self._slow if self._slow_wrong else self._fast
-            self.changes = changes = judged.changes(means)
-            if abs(changes.laser_um - changes.optics_um) <= judged.limit_um / 2 + self._lag_um:
-                self.liar, self._slow_wrong = Liar.NOBODY, False
+            judged = memory.slow if memory.slow_wrong else memory.fast
+            limit_um = self._slow_limit_um if memory.slow_wrong else self._limit_um
+            memory.changes = changes = judged.changes(means, self._sag_um)
+            if abs(changes.laser_um - changes.optics_um) <= limit_um / 2 + self._lag_um:
+                self._clear_verdict()
         else:
             self._judge_fast(means)
-            if self.liar == Liar.NOBODY:
+            if memory.liar == Liar.NOBODY:
                 self._judge_slowly(means)
-        if self.liar == Liar.NOBODY:
-            self._fast.follow(means, dt_s)
-            self._slow.follow(means, dt_s)
+        if memory.liar == Liar.NOBODY:
+            memory.fast.follow(means, dt_s, REFERENCE_S)
+            memory.slow.follow(means, dt_s, SLOW_REFERENCE_S)
 
     def _judge_fast(self, means: tuple[float, float, float]) -> None:
-        self.changes = changes = self._fast.changes(means)
-        limit_um = self._limit_um if self.liar == Liar.NOBODY else self._limit_um / 2  # and back only when clearly so
+        memory = self.memory
+        memory.changes = changes = memory.fast.changes(means, self._sag_um)
+        limit_um = (
+            self._limit_um if memory.liar == Liar.NOBODY else self._limit_um / 2
+        )  # and back only when clearly so
         agree = abs(changes.laser_um - changes.optics_um) <= limit_um + self._lag_um
-        self.liar = Liar.NOBODY if agree else changes.judge()
+        memory.liar = Liar.NOBODY if agree else changes.judge()
 
     def _judge_slowly(self, means: tuple[float, float, float]) -> None:
         """Find a camera that drifts slowly; a laser's slow drift is its mount's, and is corrected."""
-        changes = self._slow.changes(means)
-        apart = abs(changes.laser_um - changes.optics_um) > self._slow.limit_um + self._lag_um
+        memory = self.memory
+        changes = memory.slow.changes(means, self._sag_um)
+        apart = abs(changes.laser_um - changes.optics_um) > self._slow_limit_um + self._lag_um
         if apart and changes.judge() == Liar.OPTICS:
-            self.liar, self.changes, self._slow_wrong = Liar.OPTICS, changes, True
+            memory.liar = Liar.OPTICS
+            memory.changes = changes
+            memory.slow_wrong = True

@@ -13,10 +13,12 @@ the resulting error.
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.filters import LagRate
+from membrane_ctrl.model.state_tree import StateNode
 
 # Margin above the stall command, so that a rounded register or a cold pump does not stall.
 STALL_MARGIN = 0.005
@@ -62,7 +64,7 @@ class _Measured:
 
 
 def branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
-    """One branch of the pump's own: no two share one, because a controller's memory is a tree."""
+    """One branch of the pump's curve."""
     return _Measured(pump.curve_fraction, flows_um_per_s) if flows_um_per_s else _StraightLine(pump)
 
 
@@ -105,20 +107,27 @@ def _end_slope(widths: Sequence[float], chords: Sequence[float]) -> float:
     return min(max(slope, 0.0), 3 * chords[0])
 
 
+@dataclass(slots=True)
+class PumpCurveState(StateNode):
+    """How the pump runs by its commands."""
+
+    flow_um_per_s: float = 0.0  # that it gives
+    kick_left_s: float = KICK_S  # of the start pulse
+
+
 class PumpCurve:
     """The inverse of the pump, which remembers whether the pump runs, and between two branches how much it gives.
 
     Hysteresis is play: the flow stays while it lies between the branches at the command, and else moves along one.
     """
 
-    def __init__(self, pump: PumpConfig) -> None:
+    def __init__(self, pump: PumpConfig, memory: PumpCurveState | None = None) -> None:
+        self.memory = memory or PumpCurveState()
         self._start_fraction = pump.start_fraction
-        self._rising: _StraightLine | _Measured = branch(pump, pump.curve_um_per_s)
-        self._falling: _StraightLine | _Measured = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
+        self._rising = branch(pump, pump.curve_um_per_s)
+        self._falling = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
         # Below its first command a measured curve knows no running pump, on its falling branch either
         self._least_fraction = max(pump.stall_fraction + STALL_MARGIN, self._falling.lowest_fraction)
-        self._flow_um_per_s = 0.0
-        self._kick_left_s = KICK_S
 
     @property
     def least_flow_um_per_s(self) -> float:
@@ -127,12 +136,12 @@ class PumpCurve:
 
     def stopped(self) -> None:
         """Note that something else stopped the pump: the next flow starts it."""
-        self._kick_left_s = KICK_S
-        self._flow_um_per_s = 0.0
+        self.memory.kick_left_s = KICK_S
+        self.memory.flow_um_per_s = 0.0
 
     def flow(self, fraction: float) -> float:
         """Flow in um/s that a running pump gives for a command."""
-        return min(max(self._flow_um_per_s, self._rising.flow(fraction)), self._falling.flow(fraction))
+        return min(max(self.memory.flow_um_per_s, self._rising.flow(fraction)), self._falling.flow(fraction))
 
     def fraction(self, flow_um_per_s: float) -> float:
         """Command at which a running pump, from lower commands, gives a flow."""
@@ -143,12 +152,13 @@ class PumpCurve:
         if flow_um_per_s <= 0.5 * self.least_flow_um_per_s:
             self.stopped()
             return 0.0
-        branch = self._rising if flow_um_per_s > self._flow_um_per_s else self._falling
+        memory = self.memory
+        branch = self._rising if flow_um_per_s > memory.flow_um_per_s else self._falling
         fraction = min(max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction)
-        if self._kick_left_s > 0.0:
-            self._kick_left_s -= dt_s
+        if memory.kick_left_s > 0.0:
+            memory.kick_left_s -= dt_s
             fraction = max(fraction, self._start_fraction)
-        self._flow_um_per_s = self.flow(fraction)
+        memory.flow_um_per_s = self.flow(fraction)
         return fraction
 
 
@@ -191,6 +201,14 @@ def _believed(value: float, within: tuple[float, float]) -> bool:
     return math.isnan(value) or within[0] <= value <= within[1]
 
 
+@dataclass(slots=True)
+class FeedForwardState(StateNode):
+    """Rates of change of pressure and temperature."""
+
+    pressure: LagRate = field(default_factory=LagRate)
+    temperature: LagRate = field(default_factory=LagRate)
+
+
 class FeedForward:
     """Feed-forward from barometer and air thermometer; either may be switched off, or drop out (NaN), at any time.
 
@@ -198,16 +216,13 @@ class FeedForward:
     no effect.
     """
 
-    def __init__(self, loop: LoopConfig) -> None:
-        self._pressure = LagRate(loop.feedforward_filter_s, _STEP_MAX_PA)
-        self._temperature = LagRate(loop.gas_follows_air_s, _STEP_MAX_K)
-        self.set_gains(loop)
+    def __init__(self, loop: LoopConfig, memory: FeedForwardState | None = None) -> None:
+        self._loop = loop
+        self.memory = memory or FeedForwardState()
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Set gains, switches and time constants; a channel switched off decays like a lost sensor."""
         self._loop = loop
-        self._pressure.time_constant_s = loop.feedforward_filter_s
-        self._temperature.time_constant_s = loop.gas_follows_air_s
 
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
         """Flow in um/s; NaN for a missing quantity."""
@@ -215,6 +230,8 @@ class FeedForward:
         pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
         pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
         temperature_c = temperature_c if loop.feedforward_temperature else math.nan
-        pressure_um_per_s = loop.barometer_gain_um_per_pa * self._pressure.update(pressure_pa, dt_s)
-        temperature_um_per_s = loop.temperature_gain_um_per_k * self._temperature.update(temperature_c, dt_s)
+        pa_per_s = self.memory.pressure.update(pressure_pa, dt_s, loop.feedforward_filter_s, _STEP_MAX_PA)
+        k_per_s = self.memory.temperature.update(temperature_c, dt_s, loop.gas_follows_air_s, _STEP_MAX_K)
+        pressure_um_per_s = loop.barometer_gain_um_per_pa * pa_per_s
+        temperature_um_per_s = loop.temperature_gain_um_per_k * k_per_s
         return -(pressure_um_per_s + temperature_um_per_s)

@@ -5,11 +5,12 @@ Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
 from membrane_ctrl.control.centre_estimate import CentreEstimate
+from membrane_ctrl.model.state_tree import StateNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class LoopInput:
 
 
 @dataclass(frozen=True, slots=True)
-class LoopOutput:
+class LoopOutput(StateNode):
     """Results of one tick, with their components."""
 
     setpoint_um: float = math.nan  # ramp and trim
@@ -47,6 +48,26 @@ _AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
 NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
 
 
+@dataclass(slots=True)
+class InnerLoopState(StateNode):
+    """What the loop remembers from tick to tick."""
+
+    setpoint_um: float = math.nan
+    shaped_um: float = math.nan  # the setpoint behind its weight
+    measured: filters.LowPass = field(default_factory=filters.LowPass)
+    # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
+    matched: filters.LowPass = field(default_factory=filters.LowPass)
+    ramp: pid.SetpointRampState = field(default_factory=pid.SetpointRampState)
+    weight: pid.SetpointWeightState = field(default_factory=pid.SetpointWeightState)
+    integrator: pid.PidState = field(default_factory=pid.PidState)
+    feedforward: gas.FeedForwardState = field(default_factory=gas.FeedForwardState)
+    limiter: pid.FlowState = field(default_factory=pid.FlowState)
+    curve: gas.PumpCurveState = field(default_factory=gas.PumpCurveState)
+    drift: pump_drift.PumpDriftState = field(default_factory=pump_drift.PumpDriftState)
+    leak: film_health.LeakEstimate = field(default_factory=film_health.LeakEstimate)
+    learned: bool = False  # the last tick has ended a segment that told something of the pump
+
+
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
@@ -54,7 +75,14 @@ class InnerLoop:
     a bump.
     """
 
-    def __init__(self, loop: LoopConfig, pump: PumpConfig, estimator: EstimatorConfig = EstimatorConfig()) -> None:  # noqa: B008 (frozen)
+    def __init__(
+        self,
+        loop: LoopConfig,
+        pump: PumpConfig,
+        estimator: EstimatorConfig = EstimatorConfig(),  # noqa: B008 (frozen)
+        memory: InnerLoopState | None = None,
+    ) -> None:
+        self.memory = memory = memory or InnerLoopState()
         self._loop = loop
         lag_s, tick_s = estimator.pump_lag_s, 1 / loop.rate_hz
         own_s = max(1 / estimator.gain_per_s, lag_s / 3)  # a faster one drives a slow pump from limit to limit
@@ -64,21 +92,20 @@ class InnerLoop:
         self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = loop.flow_most_um_per_s(pump)
-        self._measured = filters.LowPass(loop.measurement_filter_s)
-        # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
-        self._matched = filters.LowPass(loop.measurement_filter_s)
-        self._ramp = pid.SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s)
-        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s)
-        self._pid = pid.Pid(_gains(loop), flow_max_um_per_s)
-        self._feedforward = gas.FeedForward(loop)
-        self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2)
-        self._curve = gas.PumpCurve(pump)
+        self._ramp = pid.SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s, memory.ramp)
+        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s, memory.weight)
+        self._pid = pid.Pid(_gains(loop), flow_max_um_per_s, memory.integrator)
+        self._feedforward = gas.FeedForward(loop, memory.feedforward)
+        self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2, memory.limiter)
+        self._curve = gas.PumpCurve(pump, memory.curve)
         self._probe_um = pump.probe_um
-        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S)
+        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S, memory.drift)
         self.may_probe = True  # not while gains are judged
-        self.learned = False  # this tick has ended a segment that told something of the pump
-        self._leak = film_health.LeakEstimate()
-        self._setpoint_um = self._shaped_um = math.nan
+
+    @property
+    def learned(self) -> bool:
+        """Whether the last tick has ended a segment that told something of the pump."""
+        return self.memory.learned
 
     @property
     def mean_flow_um_per_s(self) -> float:
@@ -103,26 +130,26 @@ class InnerLoop:
     @property
     def lag_um(self) -> float:
         """Present setpoint minus the last filtered reading; NaN before the first reading."""
-        return self._setpoint_um - self._measured.value
+        return self.memory.setpoint_um - self.memory.measured.value
 
     def start(self, displacement_um: float, flow_um_per_s: float) -> None:
         """Start at a reading: the setpoint ramps from there, the integrator stands at the flow.
 
         The flow is the pump's present flow, or the mean it is known to need.
         """
-        self._measured.reset(displacement_um)
+        self.memory.measured.reset(displacement_um)
         self._stand_at(displacement_um)
-        self._ramp.value_um = math.nan  # placed by the first step, which knows the trim
+        self._ramp.place(math.nan)  # placed by the first step, which knows the trim
         self._pid.place(self._limiter.place(flow_um_per_s))
         self._curve.stopped()
-        self._leak.pause()
+        self.memory.leak.pause()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """Run one automatic tick, on the estimate if there is one; `dt_s` must exceed 0.
 
         Without either, the reading counts as missing (`stale`).
         """
-        self.learned = False
+        self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
@@ -132,7 +159,7 @@ class InnerLoop:
         else:
             terms, ramp_um_per_s = self._on_estimate(given, given.estimate, dt_s)
             known_um_per_s = given.estimate.drift_um_per_s - given.estimate.leak_um_per_s
-        filtered_um = self._measured.value
+        filtered_um = self.memory.measured.value
         wanted_um_per_s = terms.sum_um_per_s + known_um_per_s + ramp_um_per_s
         probing = (
             self.may_probe and self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
@@ -143,21 +170,22 @@ class InnerLoop:
             self._pid.integrate(dt_s)
         fraction = self._command(limited_um_per_s, dt_s)
         if probing and math.isfinite(given.displacement_um):
-            self.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
+            self.memory.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
         else:
             self._drift.spoil()
         if given.estimate is None:
-            self._leak.update(self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s)
+            self.memory.leak.update(self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s)
         else:
-            self._leak.take(given.estimate.leak_um_per_s, filtered_um, dt_s)
+            self.memory.leak.take(given.estimate.leak_um_per_s, filtered_um, dt_s)
         return self._output(terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
 
     def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
-        before_um = self._measured.value
-        filtered_um = self._measured.update(given.displacement_um, dt_s)
+        before_um = self.memory.measured.value
+        filtered_um = self._filter_reading(given.displacement_um, dt_s)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, filtered_um, dt_s)
-        error_um = self._matched.update(shaped_um, dt_s) - filtered_um
+        matched_um = self.memory.matched.update(shaped_um, dt_s, self._loop.measurement_filter_s)
+        error_um = matched_um - filtered_um
         rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
@@ -167,9 +195,9 @@ class InnerLoop:
         The prediction takes dead time and lag out of the loop, and the filter, which knows the flow after its limits,
         cannot wind up. Everything that `_on_laser` needs follows, so that either may take over at any tick.
         """
-        self._measured.reset(estimate.um)
+        self.memory.measured.reset(estimate.um)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
-        self._matched.reset(shaped_um)
+        self.memory.matched.reset(shaped_um)
         self._pid.place(estimate.leak_um_per_s)
         p_um_per_s = self._error_gain_per_s * (shaped_um - estimate.ahead_um) + self._due_gain * estimate.due_um_per_s
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
@@ -182,11 +210,11 @@ class InnerLoop:
         reading that is there (a pause) is filtered all the same, so that the error is the present one.
         """
         seen = math.isfinite(given.displacement_um)
-        filtered_um = self._measured.update(given.displacement_um, dt_s) if seen else math.nan
+        filtered_um = self._filter_reading(given.displacement_um, dt_s) if seen else math.nan
         if not math.isnan(self._ramp.value_um):
-            self._setpoint_um = self._ramp.value_um + given.trim_um
+            self.memory.setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
-        self._leak.pause()
+        self.memory.leak.pause()
         self._spoil()
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
@@ -201,10 +229,10 @@ class InnerLoop:
         """
         seen = math.isfinite(given.displacement_um)
         if seen:
-            self._measured.update(given.displacement_um, dt_s)
-        if not math.isnan(self._measured.value):
-            self._stand_at(self._measured.value)
-            self._ramp.value_um = self._measured.value - given.trim_um
+            self._filter_reading(given.displacement_um, dt_s)
+        if not math.isnan(self.memory.measured.value):
+            self._stand_at(self.memory.measured.value)
+            self._ramp.place(self.memory.measured.value - given.trim_um)
         weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
         placed_um_per_s = self._limiter.place(flow_um_per_s)
         self._pid.place(placed_um_per_s - weather_um_per_s)
@@ -212,11 +240,11 @@ class InnerLoop:
         fraction = self._command(placed_um_per_s, dt_s)
         if seen:
             pumped_um_per_s = self._flow(fraction) - weather_um_per_s
-            self._leak.update(pumped_um_per_s, given.displacement_um, self._measured.value, dt_s)
+            self.memory.leak.update(pumped_um_per_s, given.displacement_um, self.memory.measured.value, dt_s)
         else:
-            self._leak.pause()
+            self.memory.leak.pause()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
-        filtered_um = self._measured.value if seen else math.nan
+        filtered_um = self.memory.measured.value if seen else math.nan
         return replace(self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um), error_um=math.nan)
 
     def resume(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
@@ -234,7 +262,7 @@ class InnerLoop:
         flow_um_per_s = self._flow(fraction)
         output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
-        self._leak.pause()
+        self.memory.leak.pause()
         output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
         return replace(output, flow_um_per_s=self._flow(fraction), pump_fraction=fraction)
 
@@ -242,14 +270,17 @@ class InnerLoop:
         """Take new settings without a bump in the flow."""
         flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)
         self._loop = loop
-        self._measured.time_constant_s = self._matched.time_constant_s = loop.measurement_filter_s
         self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = loop.setpoint_ramp_um_per_s, flow_max_um_per_s
-        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s)
-        self._weight.reset(self._shaped_um)
+        self._weight.weight = loop.setpoint_weight
+        self._weight.ti_s = loop.ti_s
+        self._weight.reset(self.memory.shaped_um)
         self._limiter.flow_max_um_per_s = self._pid.flow_max_um_per_s = flow_max_um_per_s
         self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
         self._feedforward.set_gains(loop)
         self._pid.set_gains(_gains(loop))
+
+    def _filter_reading(self, displacement_um: float, dt_s: float) -> float:
+        return self.memory.measured.update(displacement_um, dt_s, self._loop.measurement_filter_s)
 
     def _command(self, flow_um_per_s: float, dt_s: float) -> float:
         """Command for a flow, with what was learned of the pump."""
@@ -259,38 +290,43 @@ class InnerLoop:
         return self._drift.correction * self._curve.flow(fraction)
 
     def _spoil(self) -> None:
-        self.learned = False
+        self.memory.learned = False
         self._drift.spoil()
 
     def set_pump(self, pump: PumpConfig) -> None:
         """Take another curve of the pump: the mean flow becomes what that says of the mean command."""
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
-        self._flow_full_um_per_s, self._curve = pump.flow_full_um_per_s, gas.PumpCurve(pump)
-        self._drift, self._probe_um = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S), pump.probe_um
+        self._flow_full_um_per_s = pump.flow_full_um_per_s
+        self._probe_um = pump.probe_um
+        self.memory.curve = gas.PumpCurveState()
+        self._curve = gas.PumpCurve(pump, self.memory.curve)
+        self.memory.drift = pump_drift.PumpDriftState()
+        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S, self.memory.drift)
         self.set_gains(self._loop)
         self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
-        self._leak.pause()
+        self.memory.leak.pause()
 
     def _stand_at(self, setpoint_um: float) -> None:
         """Put everything that follows the setpoint to rest there."""
-        self._setpoint_um = self._shaped_um = setpoint_um
+        self.memory.setpoint_um = setpoint_um
+        self.memory.shaped_um = setpoint_um
         self._weight.reset(setpoint_um)
-        self._matched.reset(setpoint_um)
+        self.memory.matched.reset(setpoint_um)
 
     def _shape_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
         """Advance the setpoint; return it as the loop sees it, and its speed in um/s."""
-        if math.isnan(self._setpoint_um):
+        if math.isnan(self.memory.setpoint_um):
             self._stand_at(filtered_um)
         if math.isnan(self._ramp.value_um):
-            self._ramp.value_um = self._setpoint_um - given.trim_um
+            self._ramp.place(self.memory.setpoint_um - given.trim_um)
         base_um = self._ramp.advance(given.target_um, self._pid.integral_um_per_s, dt_s)
-        self._setpoint_um = base_um + given.trim_um
-        shaped_um = self._weight.update(self._setpoint_um, dt_s)
+        self.memory.setpoint_um = base_um + given.trim_um
+        shaped_um = self._weight.update(self.memory.setpoint_um, dt_s)
         # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, as it includes the
         # trim's steps.
         limit_um_per_s = self._loop.setpoint_ramp_um_per_s
-        speed_um_per_s = min(max((shaped_um - self._shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
-        self._shaped_um = shaped_um
+        speed_um_per_s = min(max((shaped_um - self.memory.shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
+        self.memory.shaped_um = shaped_um
         return shaped_um, speed_um_per_s
 
     def _output(
@@ -298,9 +334,9 @@ class InnerLoop:
     ) -> LoopOutput:
         """The outputs of the tick; flows in um/s."""
         return LoopOutput(
-            setpoint_um=self._setpoint_um,
+            setpoint_um=self.memory.setpoint_um,
             filtered_um=filtered_um,
-            error_um=self._setpoint_um - filtered_um,
+            error_um=self.memory.setpoint_um - filtered_um,
             p_um_per_s=terms.p_um_per_s,
             i_um_per_s=terms.i_um_per_s,
             d_um_per_s=terms.d_um_per_s,
@@ -309,8 +345,8 @@ class InnerLoop:
             flow_um_per_s=self._flow(fraction),
             pump_fraction=fraction,
             saturated=not 0.0 <= wanted <= self._limiter.flow_max_um_per_s,
-            leak_um_per_s=self._leak.leak_um_per_s,
-            too_tight=self._leak.too_tight,
+            leak_um_per_s=self.memory.leak.leak_um_per_s,
+            too_tight=self.memory.leak.too_tight,
         )
 
 

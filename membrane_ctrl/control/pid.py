@@ -12,13 +12,14 @@ side only, as the pump removes no gas. In the steady state dI/dt = 0, so back-ca
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from membrane_ctrl.config.control import LoopConfig
 from membrane_ctrl.control.filters import LowPass, smoothing
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
+from membrane_ctrl.model.state_tree import StateNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,47 +45,63 @@ class PidTerms:
         return self.p_um_per_s + self.i_um_per_s + self.d_um_per_s
 
 
+@dataclass(slots=True)
+class PidState(StateNode):
+    """The integrator, and the last error and measurement rate (for bumpless changes)."""
+
+    integral_um_per_s: float = 0.0
+    error_um: float = 0.0
+    rate_um_per_s: float = 0.0
+
+
 class Pid:
-    """The controller's memory: the integrator and the last error and measurement rate (for bumpless changes).
+    """PI(D) with the gains in force.
 
     The integrator stays between 0, as the pump removes no gas, and `flow_max_um_per_s`.
     """
 
-    def __init__(self, gains: PidGains, flow_max_um_per_s: float) -> None:
+    def __init__(self, gains: PidGains, flow_max_um_per_s: float, memory: PidState | None = None) -> None:
         self.gains = gains
         self.flow_max_um_per_s = flow_max_um_per_s
-        self.integral_um_per_s = 0.0
-        self._error_um = 0.0
-        self._rate_um_per_s = 0.0
+        self.memory = memory or PidState()
+
+    @property
+    def integral_um_per_s(self) -> float:
+        """The integrator: the mean flow."""
+        return self.memory.integral_um_per_s
 
     def place(self, integral_um_per_s: float) -> None:
         """Set the integrator, within its range, and forget the last error."""
-        self.integral_um_per_s = self._clamped(integral_um_per_s)
-        self._error_um = self._rate_um_per_s = 0.0
+        self.memory.integral_um_per_s = self._clamped(integral_um_per_s)
+        self.memory.error_um = 0.0
+        self.memory.rate_um_per_s = 0.0
 
     def terms(self, error_um: float, measured_rate_um_per_s: float) -> PidTerms:
         """P, I and D for the (filtered) error and the rate of the filtered measurement."""
-        self._error_um, self._rate_um_per_s = error_um, measured_rate_um_per_s
+        self.memory.error_um = error_um
+        self.memory.rate_um_per_s = measured_rate_um_per_s
         return self._terms()
 
     def integrate(self, dt_s: float) -> None:
         """Advance the integrator by the last error, back-calculated where the terms leave the pump's range."""
         wanted_um_per_s = self._terms().sum_um_per_s
         back_um_per_s = self._clamped(wanted_um_per_s) - wanted_um_per_s
-        drive_um_per_s = self.gains.kp_per_s * self._error_um + back_um_per_s
-        self.integral_um_per_s = self._clamped(self.integral_um_per_s + drive_um_per_s * dt_s / self.gains.ti_s)
+        drive_um_per_s = self.gains.kp_per_s * self.memory.error_um + back_um_per_s
+        integral_um_per_s = self.memory.integral_um_per_s + drive_um_per_s * dt_s / self.gains.ti_s
+        self.memory.integral_um_per_s = self._clamped(integral_um_per_s)
 
     def set_gains(self, gains: PidGains) -> None:
         """Change the gains and let the integrator take up the difference, so that the sum does not jump."""
         before = self._terms()
         self.gains = gains
-        self.integral_um_per_s = self._clamped(
-            self.integral_um_per_s + before.sum_um_per_s - self._terms().sum_um_per_s
+        self.memory.integral_um_per_s = self._clamped(
+            self.memory.integral_um_per_s + before.sum_um_per_s - self._terms().sum_um_per_s
         )
 
     def _terms(self) -> PidTerms:
         kp, td_s = self.gains.kp_per_s, self.gains.td_s
-        return PidTerms(kp * self._error_um, self.integral_um_per_s, -kp * td_s * self._rate_um_per_s)
+        memory = self.memory
+        return PidTerms(kp * memory.error_um, memory.integral_um_per_s, -kp * td_s * memory.rate_um_per_s)
 
     def _clamped(self, flow_um_per_s: float) -> float:
         return min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)
@@ -93,23 +110,36 @@ class Pid:
 # Range and rate of the manipulated value.
 
 
+@dataclass(slots=True)
+class FlowState(StateNode):
+    """The last flow behind the limits."""
+
+    flow_um_per_s: float = 0.0
+
+
 class FlowLimiter:
     """Keeps a flow within [0, max] and its change, either way, within a rate."""
 
-    def __init__(self, flow_max_um_per_s: float, rate_um_per_s2: float) -> None:
+    def __init__(self, flow_max_um_per_s: float, rate_um_per_s2: float, memory: FlowState | None = None) -> None:
         self.flow_max_um_per_s = flow_max_um_per_s
         self.rate_um_per_s2 = rate_um_per_s2
-        self.flow_um_per_s = 0.0
+        self.memory = memory or FlowState()
+
+    @property
+    def flow_um_per_s(self) -> float:
+        """The last flow."""
+        return self.memory.flow_um_per_s
 
     def place(self, flow_um_per_s: float) -> float:
         """Set the flow within its range, whatever its rate; returns it."""
-        self.flow_um_per_s = min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)
-        return self.flow_um_per_s
+        self.memory.flow_um_per_s = min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)
+        return self.memory.flow_um_per_s
 
     def limit(self, wanted_um_per_s: float, dt_s: float) -> float:
         """The flow nearest to the wanted one that range and rate allow."""
         step_um_per_s = self.rate_um_per_s2 * dt_s
-        low, high = self.flow_um_per_s - step_um_per_s, self.flow_um_per_s + step_um_per_s
+        flow_um_per_s = self.memory.flow_um_per_s
+        low, high = flow_um_per_s - step_um_per_s, flow_um_per_s + step_um_per_s
         return self.place(min(max(wanted_um_per_s, low), high))
 
 
@@ -124,13 +154,31 @@ APPROACH_S = 1.0
 RAMP_SHARE = 0.8
 
 
+@dataclass(slots=True)
+class SetpointRampState(StateNode):
+    """Where the ramp is; NaN before it is placed."""
+
+    value_um: float = math.nan
+
+
 class SetpointRamp:
     """Setpoint that moves to its target no faster than allowed, and no faster than the pump can take the mirror."""
 
-    def __init__(self, rate_um_per_s: float, flow_max_um_per_s: float) -> None:
+    def __init__(
+        self, rate_um_per_s: float, flow_max_um_per_s: float, memory: SetpointRampState | None = None
+    ) -> None:
         self.rate_um_per_s = rate_um_per_s
         self.flow_max_um_per_s = flow_max_um_per_s
-        self.value_um = math.nan
+        self.memory = memory or SetpointRampState()
+
+    @property
+    def value_um(self) -> float:
+        """The setpoint; NaN before it is placed."""
+        return self.memory.value_um
+
+    def place(self, value_um: float) -> None:
+        """Set the setpoint; NaN: it is placed later."""
+        self.memory.value_um = value_um
 
     def advance(self, target_um: float, mean_flow_um_per_s: float, dt_s: float) -> float:
         """Setpoint after one step towards `target_um`.
@@ -140,9 +188,16 @@ class SetpointRamp:
         """
         down = min(self.rate_um_per_s, RAMP_SHARE * mean_flow_um_per_s)
         up = min(self.rate_um_per_s, RAMP_SHARE * (self.flow_max_um_per_s - mean_flow_um_per_s))
-        speed = (target_um - self.value_um) / max(APPROACH_S, dt_s)
-        self.value_um += min(max(speed, -down), up) * dt_s
-        return self.value_um
+        speed = (target_um - self.memory.value_um) / max(APPROACH_S, dt_s)
+        self.memory.value_um += min(max(speed, -down), up) * dt_s
+        return self.memory.value_um
+
+
+@dataclass(slots=True)
+class SetpointWeightState(StateNode):
+    """The lagging part of the setpoint."""
+
+    slow: LowPass = field(default_factory=LowPass)
 
 
 class SetpointWeight:
@@ -153,17 +208,18 @@ class SetpointWeight:
     can be clamped to what the pump can do. b = 1 follows the ramp, 0 leaves the setpoint to the integrator alone.
     """
 
-    def __init__(self, weight: float, ti_s: float) -> None:
+    def __init__(self, weight: float, ti_s: float, memory: SetpointWeightState | None = None) -> None:
         self.weight = weight
-        self._slow = LowPass(ti_s)
+        self.ti_s = ti_s
+        self.memory = memory or SetpointWeightState()
 
     def reset(self, setpoint_um: float) -> None:
         """Come to rest at a setpoint."""
-        self._slow.reset(setpoint_um)
+        self.memory.slow.reset(setpoint_um)
 
     def update(self, setpoint_um: float, dt_s: float) -> float:
         """Setpoint as seen by the loop."""
-        slow_um = self._slow.update(setpoint_um, dt_s)
+        slow_um = self.memory.slow.update(setpoint_um, dt_s, self.ti_s)
         return slow_um + self.weight * (setpoint_um - slow_um)
 
 

@@ -17,12 +17,14 @@ apart: the leak that is reported is their sum.
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
+from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
 PROBE_RAD_PER_S = 2 * math.pi / 5.0  # above the weather, below where the pump's lag matters
 SEGMENT_S = 60.0  # a whole number of periods
@@ -45,66 +47,84 @@ _SIGN_SEED = 0b1010_0110_1011_1001
 
 
 @dataclass(frozen=True, slots=True)
-class PumpScale:
+class PumpScale(StateNode):
     """What is known of the pump: its flow relative to the configured curve, and one standard error."""
 
     scale: float = 1.0
     sigma: float = SIGMA_FIRST
 
 
+_Pair = Annotated[ComplexArray, ArrayShape((2,), "<c16")]
+
+
+@dataclass(slots=True)
+class PumpDriftState(StateNode):
+    """The open segment, and what the earlier ones have taught."""
+
+    known: PumpScale = PumpScale()  # estimate after the last segment
+    correction: float = 1.0  # scale that the loop may use: follows the estimate slowly, not within its error bar
+    signs: Count = _SIGN_SEED
+    sign: float = 1.0
+    time_s: float = 0.0  # in the segment
+    whole: bool = True  # no tick of the segment is missing
+    mean_um: LowPass = field(default_factory=LowPass)
+    mean_flow: LowPass = field(default_factory=LowPass)
+    sums: _Pair = field(default_factory=lambda: np.zeros(2, complex))  # of the segment: centre and flow
+    means: _Pair = field(default_factory=lambda: np.zeros(2, complex))  # of the segments: motion seen, and expected
+    rate_per_s: float = 0.0  # of the scale
+    # covariance of scale and rate
+    spread: Annotated[FloatArray, ArrayShape((2, 2))] = field(
+        default_factory=lambda: np.diag([SIGMA_FIRST**2, RATE_PER_S**2])
+    )
+    scatter: float = 0.0
+    count: Count = 0
+
+
 class PumpDrift:
-    """Probes the pump and learns its scale. `delay_s`, `lag_s`: of the flow behind the command.
+    """Probes the pump and learns its scale. `delay_s`, `lag_s`: of the flow behind the command."""
 
-    Attributes
-    ----------
-    known : PumpScale
-        Estimate after the last segment.
-    correction : float
-        Scale that the loop may use: follows the estimate slowly, and not within its error bar.
-    """
-
-    def __init__(self, delay_s: float, lag_s: float) -> None:
-        self.known = PumpScale()
-        self.correction = 1.0
+    def __init__(self, delay_s: float, lag_s: float, memory: PumpDriftState | None = None) -> None:
+        self.memory = memory or PumpDriftState()
         w = PROBE_RAD_PER_S
         self._path: ComplexArray = np.array([cmath.exp(-1j * w * delay_s) / (1j * w * (1 + 1j * w * lag_s))])
-        self._signs = _SIGN_SEED
-        self._sign = 1.0
-        self._time_s = 0.0  # in the segment
-        self._whole = True  # no tick of the segment is missing
-        self._mean_um, self._mean_flow = LowPass(SEGMENT_S), LowPass(SEGMENT_S)
-        self._sums: ComplexArray = np.zeros(2, complex)  # of the segment: centre and flow
-        self._means: ComplexArray = np.zeros(2, complex)  # of the segments: motion seen, and expected
-        self._rate_per_s = 0.0  # of the scale
-        self._spread: FloatArray = np.diag([SIGMA_FIRST**2, RATE_PER_S**2])  # covariance of scale and rate
-        self._scatter = 0.0
-        self._count = 0
+
+    @property
+    def known(self) -> PumpScale:
+        """Estimate after the last segment."""
+        return self.memory.known
+
+    @property
+    def correction(self) -> float:
+        """Scale that the loop may use."""
+        return self.memory.correction
 
     def flow_um_per_s(self, amplitude_um: float) -> float:
         """The probe now; `amplitude_um` is that of the centre's motion without the loop's answer."""
-        return self._sign * amplitude_um * PROBE_RAD_PER_S * math.sin(PROBE_RAD_PER_S * self._time_s)
+        memory = self.memory
+        return memory.sign * amplitude_um * PROBE_RAD_PER_S * math.sin(PROBE_RAD_PER_S * memory.time_s)
 
     def spoil(self) -> None:
         """The segment cannot be used: no reading, or the flow was not the loop's."""
-        self._whole = False
+        self.memory.whole = False
 
     def step(self, displacement_um: float, flow_um_per_s: float, dt_s: float) -> bool:
         """Take a tick: the reading, and the flow by the configured curve from then on. True if it ends a segment."""
-        if self._time_s >= _SETTLE_S:
-            turn = self._sign * cmath.exp(-1j * PROBE_RAD_PER_S * self._time_s) * dt_s
+        memory = self.memory
+        if memory.time_s >= _SETTLE_S:
+            turn = memory.sign * cmath.exp(-1j * PROBE_RAD_PER_S * memory.time_s) * dt_s
             # without the means, which are no answer to the probe
-            self._sums[0] += turn * (displacement_um - self._mean_um.value)
+            memory.sums[0] += turn * (displacement_um - memory.mean_um.value)
             # the flow is held until the next reading: half a tick late
             late = cmath.exp(-0.5j * PROBE_RAD_PER_S * dt_s)
-            self._sums[1] += turn * late * (flow_um_per_s - self._mean_flow.value)
-        self._mean_um.update(displacement_um, dt_s)
-        self._mean_flow.update(flow_um_per_s, dt_s)
-        self._time_s += dt_s
-        if self._time_s < SEGMENT_S - 0.5 * dt_s:
+            memory.sums[1] += turn * late * (flow_um_per_s - memory.mean_flow.value)
+        memory.mean_um.update(displacement_um, dt_s, SEGMENT_S)
+        memory.mean_flow.update(flow_um_per_s, dt_s, SEGMENT_S)
+        memory.time_s += dt_s
+        if memory.time_s < SEGMENT_S - 0.5 * dt_s:
             return False
-        used = self._whole and bool(np.isfinite(self._sums).all())
+        used = memory.whole and bool(np.isfinite(memory.sums).all())
         if used:
-            centre, flow = self._sums.tolist()
+            centre, flow = memory.sums.tolist()
             self._learn(centre, flow * complex(self._path[0]))
         self._follow()
         self._next_segment()
@@ -112,39 +132,45 @@ class PumpDrift:
 
     def _learn(self, centre: complex, expected: complex) -> None:
         """Compare a segment's motion with that expected of the configured curve."""
-        self._count += 1
-        share = 1 / min(self._count, _SEGMENTS)
-        self._means += share * (np.array([centre, expected]) - self._means)
-        answer, usual = self._means.tolist()
-        along = answer if self._count > _SEGMENTS else usual
+        memory = self.memory
+        memory.count += 1
+        share = 1 / min(memory.count, _SEGMENTS)
+        memory.means += share * (np.array([centre, expected]) - memory.means)
+        answer, usual = memory.means.tolist()
+        along = answer if memory.count > _SEGMENTS else usual
         size = abs(usual)
         if not size * abs(along):
             return
-        scale = self.known.scale + self._rate_per_s * SEGMENT_S
+        scale = memory.known.scale + memory.rate_per_s * SEGMENT_S
         off = (centre * along.conjugate()).real / abs(along) - scale * (expected * usual.conjugate()).real / size
-        if self._count <= _LEARNED:
-            self._scatter += share * (off**2 - self._scatter)
+        if memory.count <= _LEARNED:
+            memory.scatter += share * (off**2 - memory.scatter)
             return
-        most = _CLIP * math.sqrt(self._scatter)
+        most = _CLIP * math.sqrt(memory.scatter)
         off = min(max(off, -most), most)
-        spread = _PASSES @ self._spread @ _PASSES.T + _WANDERS
-        gain = spread[0] * size / (self._scatter + spread[0, 0] * size**2)
-        self._spread = spread - np.outer(gain, spread[0]) * size
-        self._rate_per_s = _KEEPS * self._rate_per_s + float(gain[1]) * off
-        self.known = PumpScale(scale + float(gain[0]) * off, math.hypot(math.sqrt(self._spread[0, 0]), _SIGMA_LEAST))
-        self._scatter += share * (off**2 - self._scatter)
+        spread = _PASSES @ memory.spread @ _PASSES.T + _WANDERS
+        gain = spread[0] * size / (memory.scatter + spread[0, 0] * size**2)
+        memory.spread = spread - np.outer(gain, spread[0]) * size
+        memory.rate_per_s = _KEEPS * memory.rate_per_s + float(gain[1]) * off
+        memory.known = PumpScale(
+            scale + float(gain[0]) * off, math.hypot(math.sqrt(memory.spread[0, 0]), _SIGMA_LEAST)
+        )
+        memory.scatter += share * (off**2 - memory.scatter)
 
     def _follow(self) -> None:
-        known, step = self.known, _RATE_PER_S * SEGMENT_S
-        if abs(known.scale - self.correction) > _SURE * known.sigma:
+        memory = self.memory
+        known, step = memory.known, _RATE_PER_S * SEGMENT_S
+        if abs(known.scale - memory.correction) > _SURE * known.sigma:
             goal = min(max(known.scale, RANGE[0]), RANGE[1])
-            self.correction += min(max(goal - self.correction, -step), step)
+            memory.correction += min(max(goal - memory.correction, -step), step)
 
     def _next_segment(self) -> None:
         """Alternate the sign by a shift register of 16 bits: the same in every run, and like nothing else."""
-        bits = self._signs
+        memory = self.memory
+        bits = memory.signs
         bit = (bits ^ (bits >> 2) ^ (bits >> 3) ^ (bits >> 5)) & 1
-        self._signs = (bits >> 1) | (bit << 15)
-        self._sign = 1.0 if bit else -1.0
-        self._time_s, self._whole = 0.0, True
-        self._sums[:] = 0.0
+        memory.signs = (bits >> 1) | (bit << 15)
+        memory.sign = 1.0 if bit else -1.0
+        memory.time_s = 0.0
+        memory.whole = True
+        memory.sums[:] = 0.0

@@ -11,7 +11,8 @@ is only a tracker to tune.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.state_tree import ArrayShape, StateNode
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # The reference of the shape loop: the mean of the first shapes.
 
@@ -30,23 +33,37 @@ SHAPES = 5
 TRACKED_SHAPES, TRACKED_EVERY_S = 25, 0.4
 
 
-class ReferenceMean:
+_Coefficients = Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceShape(StateNode):
+    """One of the shapes that make a reference."""
+
+    time_s: float
+    displacement_um: float
+    coeffs_um: _Coefficients
+    of_frame: bool  # tracked in a single frame
+
+
+@dataclass(slots=True)
+class ReferenceMean(StateNode):
     """Mean coefficients, laser reading and time of a few shapes."""
 
-    def __init__(self) -> None:
-        self._taken: list[shape_estimate.ShapeEstimate] = []
-        self.coeffs_um: FloatArray = np.empty(0)
-        self.displacement_um = self.time_s = math.nan
+    taken: list[ReferenceShape] = field(default_factory=list)
+    coeffs_um: _Coefficients = field(default_factory=lambda: np.full(ZERNIKE_TERMS, math.nan))
+    displacement_um: float = math.nan
+    time_s: float = math.nan
 
     @property
     def wanted(self) -> int:
         """Number of shapes that make a reference."""
-        return TRACKED_SHAPES if self._taken and self._taken[-1].kind == "track" else SHAPES
+        return TRACKED_SHAPES if self.taken and self.taken[-1].of_frame else SHAPES
 
     @property
     def count(self) -> int:
         """Number taken."""
-        return len(self._taken)
+        return len(self.taken)
 
     @property
     def complete(self) -> bool:
@@ -55,12 +72,14 @@ class ReferenceMean:
 
     def take(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take one more; of single frames, one per `TRACKED_EVERY_S`."""
-        if self._taken and estimate.kind == "track" and estimate.time_s < self._taken[-1].time_s + TRACKED_EVERY_S:
+        of_frame = estimate.kind == "track"
+        if self.taken and of_frame and estimate.time_s < self.taken[-1].time_s + TRACKED_EVERY_S:
             return
-        self._taken.append(estimate)
-        self.coeffs_um = np.mean([e.coeffs_um for e in self._taken], axis=0)
-        self.displacement_um = float(np.mean([e.displacement_um for e in self._taken]))
-        self.time_s = float(np.mean([e.time_s for e in self._taken]))
+        coeffs_um = np.array(estimate.coeffs_um, dtype=float)
+        self.taken.append(ReferenceShape(estimate.time_s, estimate.displacement_um, coeffs_um, of_frame))
+        self.coeffs_um = np.mean([shape.coeffs_um for shape in self.taken], axis=0)
+        self.displacement_um = float(np.mean([shape.displacement_um for shape in self.taken]))
+        self.time_s = float(np.mean([shape.time_s for shape in self.taken]))
 
 
 # Change of sag from the change of a Zernike vector.
@@ -83,7 +102,7 @@ MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0
 
 
 @dataclass(frozen=True, slots=True)
-class SagChange:
+class SagChange(StateNode):
     """Change of sag in um, positive when the bowl deepens, and its standard deviation."""
 
     change_um: float
@@ -119,45 +138,57 @@ class ShapeOutput:
     age_s: float  # age of the last admitted estimate; NaN until there is one
 
 
+@dataclass(slots=True)
+class ShapeLoopState(StateNode):
+    """What the loop remembers from tick to tick."""
+
+    state: telemetry.ShapeState = telemetry.ShapeState.OFF
+    reason: str = "switched off"
+    trim_um: float = 0.0
+    base_um: float = 0.0  # the trim at lock
+    reference: ReferenceMean = field(default_factory=ReferenceMean)
+    drift: DriftTracker = field(default_factory=DriftTracker)
+    change: SagChange = SagChange(math.nan, math.nan)  # as last admitted
+    admitted_s: float = math.nan
+    seen_s: float = math.nan
+    settled_since_s: float = math.inf
+
+
 class ShapeLoop:
     """Trim from shape estimates; off until switched on. `sensitivity` as for `sag_change`."""
 
-    def __init__(self, config: ShapeConfig, sensitivity: FloatArray) -> None:
+    def __init__(self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopState | None = None) -> None:
         self._config = config
         self._sensitivity = sensitivity
-        self._state = telemetry.ShapeState.OFF
-        self._reason = "switched off"
-        self._trim_um = 0.0
-        self._base_um = 0.0
-        self._reference = ReferenceMean()
-        self._drift = DriftTracker(config.time_constant_s)
-        self._change = SagChange(math.nan, math.nan)
-        self._admitted_s = math.nan
-        self._seen_s = math.nan
-        self._settled_since_s = math.inf
+        self._time_constant_s = config.time_constant_s
+        self.memory = memory or ShapeLoopState()
 
     @property
     def on(self) -> bool:
         """Whether it is switched on."""
-        return self._state != telemetry.ShapeState.OFF
+        return self.memory.state != telemetry.ShapeState.OFF
 
     def set_memory(self, time_constant_s: float) -> None:
         """Set the tracker's memory; the trim does not jump."""
-        self._drift.memory_s = time_constant_s
+        self._time_constant_s = time_constant_s
 
     def switch(self, on: bool, now_s: float) -> None:
         """Switch on, taking a new reference from the present trim, or off, holding the trim."""
-        if on and self._state == telemetry.ShapeState.OFF:
+        if on and self.memory.state == telemetry.ShapeState.OFF:
             self.lock(now_s)
         elif not on:
-            self._state, self._reason = telemetry.ShapeState.OFF, "switched off"
+            self.memory.state = telemetry.ShapeState.OFF
+            self.memory.reason = "switched off"
 
     def lock(self, now_s: float) -> None:
         """Take the figure from now on as the reference; hold the trim meanwhile."""
-        self._state, self._reason = telemetry.ShapeState.WAITING, "waiting for the first shape"
-        self._reference = ReferenceMean()
-        self._change = SagChange(math.nan, math.nan)
-        self._admitted_s, self._seen_s = math.nan, now_s
+        memory = self.memory
+        memory.state = telemetry.ShapeState.WAITING
+        memory.reason = "waiting for the first shape"
+        memory.reference = ReferenceMean()
+        memory.change = SagChange(math.nan, math.nan)
+        memory.admitted_s = math.nan
+        memory.seen_s = now_s
 
     def step(
         self,
@@ -174,30 +205,30 @@ class ShapeLoop:
         camera must not be believed, if so.
         """
         if not settled:
-            self._settled_since_s = math.inf
-        elif math.isinf(self._settled_since_s):
-            self._settled_since_s = now_s
-        if self._state != telemetry.ShapeState.OFF:
+            self.memory.settled_since_s = math.inf
+        elif math.isinf(self.memory.settled_since_s):
+            self.memory.settled_since_s = now_s
+        if self.memory.state != telemetry.ShapeState.OFF:
             if estimate is not None:
-                self._seen_s = estimate.time_s
+                self.memory.seen_s = estimate.time_s
             refusal = distrust or self._refusal(now_s, estimate, displacement_um, settled)
             if refusal:
                 self._refuse(refusal)
             elif estimate is not None:
                 self._admit(estimate)
-            if self._state == telemetry.ShapeState.TRACKING:
+            if self.memory.state == telemetry.ShapeState.TRACKING:
                 self._move_trim(now_s, dt_s)
         return self.output(now_s)
 
     def output(self, now_s: float) -> ShapeOutput:
         """The output of the last tick, with the present age of its estimate."""
         return ShapeOutput(
-            self._state,
-            self._reason,
-            self._trim_um,
-            self._change.change_um,
-            self._change.sigma_um,
-            now_s - self._admitted_s,
+            self.memory.state,
+            self.memory.reason,
+            self.memory.trim_um,
+            self.memory.change.change_um,
+            self.memory.change.sigma_um,
+            now_s - self.memory.admitted_s,
         )
 
     def _refusal(
@@ -207,15 +238,15 @@ class ShapeLoop:
         config = self._config
         if not settled:
             return "the inner loop is not settled"
-        if now_s - self._seen_s > config.fresh_s:
+        if now_s - self.memory.seen_s > config.fresh_s:
             return f"no shape younger than {config.fresh_s:g} s"
         if estimate is None:
             return ""
         if estimate.verdict == "rejected":
             return f"shape rejected: {estimate.reason}"
-        if estimate.time_s < self._settled_since_s:
+        if estimate.time_s < self.memory.settled_since_s:
             return "the shape was taken while the inner loop was not settled"
-        if estimate.time_s <= self._admitted_s:
+        if estimate.time_s <= self.memory.admitted_s:
             return "the shape is not newer than the last one"
         if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
             return "the shape is not finite"
@@ -228,37 +259,43 @@ class ShapeLoop:
 
     def _refuse(self, reason: str) -> None:
         """Hold the trim and say why."""
-        if self._state != telemetry.ShapeState.WAITING:
-            self._state = telemetry.ShapeState.SUSPENDED
-        self._reason = reason
+        if self.memory.state != telemetry.ShapeState.WAITING:
+            self.memory.state = telemetry.ShapeState.SUSPENDED
+        self.memory.reason = reason
 
     def _admit(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Use an estimate: for the reference first, then for the drift, unless camera and laser disagree."""
-        if self._state == telemetry.ShapeState.WAITING:
-            self._admitted_s = estimate.time_s
-            self._reference.take(estimate)
-            self._reason = f"reference: shape {self._reference.count} of {self._reference.wanted}"
-            if self._reference.complete:
-                self._state, self._reason = telemetry.ShapeState.TRACKING, ""
-                self._base_um = self._trim_um
-                self._drift.begin(self._reference.time_s)
+        memory, reference = self.memory, self.memory.reference
+        if memory.state == telemetry.ShapeState.WAITING:
+            memory.admitted_s = estimate.time_s
+            reference.take(estimate)
+            memory.reason = f"reference: shape {reference.count} of {reference.wanted}"
+            if reference.complete:
+                memory.state = telemetry.ShapeState.TRACKING
+                memory.reason = ""
+                memory.base_um = memory.trim_um
+                memory.drift.begin(reference.time_s)
+                reference.taken.clear()  # their mean is all that is needed
             return
-        change = sag_change(estimate.coeffs_um, self._reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
-        drift_um = estimate.displacement_um - self._reference.displacement_um - change.change_um
-        apart_um = drift_um - self._drift.at(estimate.time_s)
+        change = sag_change(estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
+        drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
+        apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
             self._refuse(f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock anew")
             return
-        self._admitted_s, self._change = estimate.time_s, change
-        self._drift.take(drift_um, estimate.time_s)
-        self._state, self._reason = telemetry.ShapeState.TRACKING, ""
+        memory.admitted_s = estimate.time_s
+        memory.change = change
+        memory.drift.take(drift_um, estimate.time_s, self._time_constant_s)
+        memory.state = telemetry.ShapeState.TRACKING
+        memory.reason = ""
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Move the trim to the drift, bounded in rate and range."""
         config = self._config
-        goal_um = self._base_um + self._drift.at(now_s)
+        memory = self.memory
+        goal_um = memory.base_um + memory.drift.at(now_s, self._time_constant_s)
         bounded_um = min(max(goal_um, -config.trim_max_um), config.trim_max_um)
         step_um = config.trim_rate_max_um_per_s * dt_s
-        self._trim_um += min(max(bounded_um - self._trim_um, -step_um), step_um)
+        memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)
         at_limit = bounded_um != goal_um
-        self._reason = f"trim at its limit of {config.trim_max_um:g} um" if at_limit else ""
+        memory.reason = f"trim at its limit of {config.trim_max_um:g} um" if at_limit else ""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
@@ -10,6 +10,7 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import State
 
 Kind = Literal[
@@ -186,6 +187,25 @@ def _settings(command: Command) -> dict[str, object] | None:
     return command.loop.model_dump() | ({} if command.pump is None else {"pump": command.pump.model_dump()})
 
 
+@dataclass(frozen=True, slots=True)
+class Gains(StateNode):
+    """All settings that a `gains` command changes."""
+
+    loop: LoopConfig
+    shape_time_constant_s: float
+    pump: PumpConfig
+
+
+@dataclass(slots=True)
+class GainsState(StateNode):
+    """The settings in force, and those that a trial goes back to."""
+
+    good: Gains
+    tried: Gains
+    until_s: float = math.nan  # end of the trial; NaN: there is none
+    setpoint_step_um: float = math.nan  # part of the trial; NaN: the setpoint and the shape loop are not
+
+
 class GainsTrial:
     """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a run's first are good.
 
@@ -193,51 +213,52 @@ class GainsTrial:
     (docs/decisions/78-gains-on-trial.md).
     """
 
-    def __init__(self, loop: LoopConfig, shape_time_constant_s: float, pump: PumpConfig) -> None:
-        self._good = self._tried = loop
-        self._good_shape_s = self._tried_shape_s = shape_time_constant_s
-        self._good_pump = self._tried_pump = pump
-        self._until_s = math.nan
-        self.setpoint_step_um = math.nan  # part of the trial; NaN: the setpoint and the shape loop are not
+    def __init__(self, memory: GainsState) -> None:
+        self.memory = memory
 
     @property
     def on_trial(self) -> bool:
         """The present gains are not kept yet."""
-        return math.isfinite(self._until_s)
+        return math.isfinite(self.memory.until_s)
 
     def begin(self, loop: LoopConfig, command: Command, now_s: float) -> None:
         """Set a command's gains for as many seconds as its value, or permanently if that is NaN."""
-        self._tried, self._tried_pump = loop, command.pump or self._tried_pump
-        self.setpoint_step_um = command.setpoint_step_um
+        memory = self.memory
+        tried = replace(memory.tried, loop=loop)
+        if command.pump is not None:
+            tried = replace(tried, pump=command.pump)
         if math.isfinite(command.shape_time_constant_s):
-            self._tried_shape_s = command.shape_time_constant_s
-        self._until_s = now_s + command.value
+            tried = replace(tried, shape_time_constant_s=command.shape_time_constant_s)
+        memory.tried = tried
+        memory.setpoint_step_um = command.setpoint_step_um
+        memory.until_s = now_s + command.value
         if not self.on_trial:
             self.keep()
 
     @property
-    def shape_time_constant_s(self) -> float:
-        """The shape loop's time constant now in force."""
-        return self._tried_shape_s
+    def in_force(self) -> Gains:
+        """The present settings."""
+        return self.memory.tried
 
     @property
-    def pump(self) -> PumpConfig:
-        """The pump's curve now in force."""
-        return self._tried_pump
+    def setpoint_step_um(self) -> float:
+        """The trial's step of the setpoint; NaN: the setpoint and the shape loop are no part of it."""
+        return self.memory.setpoint_step_um
 
     def keep(self) -> None:
         """Keep the present gains."""
-        self._good, self._good_shape_s, self._until_s = self._tried, self._tried_shape_s, math.nan
-        self._good_pump = self._tried_pump
-        self.setpoint_step_um = math.nan
+        self.memory.good = self.memory.tried
+        self._end()
 
     def overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
-        return now_s >= self._until_s
+        return now_s >= self.memory.until_s
 
-    def revert(self) -> LoopConfig:
-        """Restore the last good settings, and return the gains."""
-        self._tried, self._tried_shape_s, self._until_s = self._good, self._good_shape_s, math.nan
-        self._tried_pump = self._good_pump
-        self.setpoint_step_um = math.nan
-        return self._good
+    def revert(self) -> None:
+        """Restore the last good settings."""
+        self.memory.tried = self.memory.good
+        self._end()
+
+    def _end(self) -> None:
+        self.memory.until_s = math.nan
+        self.memory.setpoint_step_um = math.nan

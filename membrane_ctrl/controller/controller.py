@@ -25,7 +25,8 @@ from membrane_ctrl.controller import (
     states,
 )
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.scene import Scene, obey, telemetry_row
+from membrane_ctrl.controller.scene import Scene, obey, telemetry_row, values_of
+from membrane_ctrl.controller.state import ControllerState, ReportedShape, first_state
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
@@ -47,33 +48,51 @@ class Controller:
     loop.
     """
 
-    def __init__(self, config: Config, sag_sensitivity: arrays.FloatArray) -> None:
+    def __init__(
+        self, config: Config, sag_sensitivity: arrays.FloatArray, memory: ControllerState | None = None
+    ) -> None:
         self._config = config
-        self._safety = safety.SafetyTable(config.limits)
-        self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity)
-        observer = Observer(config)
-        loop = inner_loop.InnerLoop(config.loop, config.pump, config.estimator)
-        levels, standstill = safe_levels.SafeLevels(config.states), pump_obeys.Standstill(config.loop, config.states)
-        circuits = interlocks.Interlocks(config.interlocks)
+        self.memory = memory = memory or first_state(config)
+        self._gains = commands.GainsTrial(memory.gains)
+        in_force = self._in_force
+        self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
+        self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
+        self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
         self._scene = Scene(
-            config, config.loop, config.pump, loop, observer, levels, standstill, circuits, config.loop.setpoint_um
+            config=config,
+            loop_config=in_force.loop,
+            pump_config=in_force.pump,
+            loop=inner_loop.InnerLoop(in_force.loop, in_force.pump, config.estimator, memory.loop),
+            observer=Observer(config, memory.observer),
+            levels=safe_levels.SafeLevels(config.states, memory.levels),
+            standstill=pump_obeys.Standstill(config.loop, config.states, memory.standstill),
+            interlocks=interlocks.Interlocks(config.interlocks, memory.interlocks),
+            **values_of(memory.scene),
         )
-        self._resume = safe_levels.ResumeRule(config.resume, config.limits)
-        self._gains = commands.GainsTrial(config.loop, config.shape.time_constant_s, config.pump)
-        self._setpoint_back_um = math.nan  # after a trial that steps the setpoint
-        self._shape_back = False  # likewise: the shape loop is on again
-        self._consistency = sensor_consistency.SensorConsistency(config)
-        self._holders = sensor_consistency.Holders(config)
+        memory.scene = self._scene
+        if memory.scene.trial_memory is not None:
+            self._scene.trial = trial.Trial(memory.scene.trial_memory, config.loop.rate_hz)
+        self._resume = safe_levels.ResumeRule(config.resume, config.limits, memory.resume)
+        self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
+        self._holders = sensor_consistency.Holders(config, memory.holders)
+        self._holders.set_gains(in_force.loop)
+        self._consistency.set_gains(in_force.loop, in_force.pump)
         self._answers: list[tuple[int, str]] = []
         self._clear_mask = 0
-        self._tick_error = ""
-        self._ticks = 0
-        self._state_since_s = math.nan
-        self._said_why = self._why_words = ""
-        self._why_since_s = 0.0
-        self._shape_was: tuple[int, str] = (-1, "")
-        self.state = State.STANDBY
-        self.fault: safety.Rule | None = None
+
+    @property
+    def state(self) -> State:
+        """The present state."""
+        return self.memory.state
+
+    @property
+    def fault(self) -> safety.Rule | None:
+        """The standing fault."""
+        return None if self.memory.fault is None else safety.RULES[self.memory.fault]
+
+    @fault.setter
+    def fault(self, rule: safety.Rule | None) -> None:
+        self.memory.fault = None if rule is None else rule.code
 
     @property
     def loop_config(self) -> LoopConfig:
@@ -87,7 +106,8 @@ class Controller:
 
     @property
     def _in_force(self) -> Config:
-        return self._config.model_copy(update={"loop": self.loop_config, "pump": self.pump_config})
+        gains = self._gains.in_force
+        return self._config.model_copy(update={"loop": gains.loop, "pump": gains.pump})
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
         """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
@@ -109,7 +129,7 @@ class Controller:
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
         observation = replace(
             scene.observer.observe(inputs, error_um),
-            tick_error=self._tick_error,
+            tick_error=self.memory.tick_error,
             overdue=scene.overdue,
             unfit=scene.unfit,
             laser_lies=consistency.laser_lies,
@@ -133,8 +153,9 @@ class Controller:
             shape = replace(shape, trim_um=estimate.mount_um)
         scene.laser_doubted = bool(consistency.laser_lies)
         scene.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
-        if math.isnan(self._state_since_s):  # the verdict has just changed the state
-            self._state_since_s, scene.state_age_s = inputs.now_s, 0.0
+        if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
+            self.memory.state_since_s = inputs.now_s
+            scene.state_age_s = 0.0
         self._act(events)
         if scene.loop.learned and self.state == State.HOLD:
             events += self._consistency.told_of_pump(scene.loop)
@@ -145,7 +166,7 @@ class Controller:
         fault = self.fault.code if self.fault else 0
         return TickOutputs(
             command=command,
-            row=telemetry_row(scene, self.state, fault, self._ticks, inputs, observation, shape),
+            row=telemetry_row(scene, self.state, fault, self.memory.ticks, inputs, observation, shape),
             events=tuple(events),
             finished=scene.finished,
             answers=tuple(self._answers),
@@ -174,15 +195,15 @@ class Controller:
 
     def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
         scene = self._scene
-        self._ticks += 1
+        self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
         scene.now_s = inputs.now_s
         scene.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
-        if self._ticks == 1:
+        if self.memory.ticks == 1:
             self._shape.switch(self._config.shape.enabled, inputs.now_s)
-        if math.isnan(self._state_since_s):  # the state's first tick
-            self._state_since_s = inputs.now_s
-        scene.state_age_s = inputs.now_s - self._state_since_s
+        if math.isnan(self.memory.state_since_s):  # the state's first tick
+            self.memory.state_since_s = inputs.now_s
+        scene.state_age_s = inputs.now_s - self.memory.state_since_s
         events += scene.interlocks.look(inputs.reading, self.state)
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
@@ -210,8 +231,8 @@ class Controller:
     def _do(self, command: commands.Command, events: list[told.Event]) -> None:
         scene = self._scene
         match command.kind:
-            case "setpoint" if math.isfinite(self._setpoint_back_um):  # it stays
-                self._setpoint_back_um = command.value
+            case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
+                self.memory.setpoint_back_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
                 self._gains.begin(command.loop, command, scene.now_s)
@@ -221,7 +242,7 @@ class Controller:
                 self._step_setpoint()
             case "shape_on" | "shape_off":
                 self._shape.switch(command.kind == "shape_on", scene.now_s)
-                self._shape_back = command.kind == "shape_on"
+                self.memory.shape_back = command.kind == "shape_on"
             case "resumed":
                 self._resume.resumed(scene.now_s - command.value)
             case "ack":
@@ -265,45 +286,51 @@ class Controller:
         if command.kind in ("manual", "tune") and scene.levels.safe_level != SafeLevel.NONE:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
-            now_um = self._setpoint_back_um if math.isfinite(self._setpoint_back_um) else scene.setpoint_um
+            now_um = (
+                self.memory.setpoint_back_um if math.isfinite(self.memory.setpoint_back_um) else scene.setpoint_um
+            )
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
             return commands.refusal(stepped, self.state, self._in_force)
         if command.kind != "tune" or spec is None:
             return ""
         centre_um = scene.setpoint_um + scene.trim_um
         try:
-            scene.trial = trial.Trial(spec, scene.loop_config, scene.pump_config, centre_um)
+            begun = trial.begin_trial(spec, scene.loop_config, scene.pump_config, centre_um)
+            scene.begin_trial(trial.Trial(begun, self._config.loop.rate_hz))
         except ValueError as error:
             return str(error)
         scene.hold_wanted = False
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
-        scene, pump = self._scene, self._gains.pump
+        scene, pump = self._scene, self._gains.in_force.pump
         if pump != scene.pump_config:
             scene.loop.set_pump(pump)
         scene.loop_config, scene.pump_config = loop, pump
         scene.loop.set_gains(loop)
         self._holders.set_gains(loop)
         self._consistency.set_gains(loop, pump)
-        self._shape.set_memory(self._gains.shape_time_constant_s)
+        self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
         self._step_setpoint()
 
     def _step_setpoint(self) -> None:
         """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as before it."""
         scene, step_um = self._scene, self._gains.setpoint_step_um
-        stepped = math.isfinite(self._setpoint_back_um)
+        stepped = math.isfinite(self.memory.setpoint_back_um)
         if math.isfinite(step_um):
             if not stepped:
-                self._setpoint_back_um, self._shape_back = scene.setpoint_um, self._shape.on
+                self.memory.setpoint_back_um = scene.setpoint_um
+                self.memory.shape_back = self._shape.on
                 self._shape.switch(False, scene.now_s)
-            scene.setpoint_um = self._setpoint_back_um + step_um
+            scene.setpoint_um = self.memory.setpoint_back_um + step_um
         elif stepped:
-            scene.setpoint_um, self._setpoint_back_um = self._setpoint_back_um, math.nan
-            self._shape.switch(self._shape_back, scene.now_s)
+            scene.setpoint_um = self.memory.setpoint_back_um
+            self.memory.setpoint_back_um = math.nan
+            self._shape.switch(self.memory.shape_back, scene.now_s)
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
-        self._set_gains(self._gains.revert())
+        self._gains.revert()
+        self._set_gains(self._gains.in_force.loop)
         events.append(told.GainsReverted(why))
 
     def _consider_resuming(self, observation: safety.Observation) -> None:
@@ -345,12 +372,13 @@ class Controller:
                 inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled, distrust
             )
         except (ValueError, ArithmeticError, LinAlgError) as error:
-            self._tick_error = f"shape loop: {type(error).__name__}: {error}"
+            self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
             shape = self._shape.output(inputs.now_s)
         scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news
-        if (shape.state, words) != self._shape_was:
-            self._shape_was = (shape.state, words)
+        reported = ReportedShape(shape.state, words)
+        if reported != self.memory.reported_shape:
+            self.memory.reported_shape = reported
             events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason))
         return shape
 
@@ -361,7 +389,7 @@ class Controller:
         try:
             wanted = states.run_state(self.state, scene)
         except Exception as error:
-            self._tick_error = f"{type(error).__name__}: {error}"
+            self.memory.tick_error = f"{type(error).__name__}: {error}"
             # an error must not close an open vent
             vents = scene.venting or scene.levels.safe_level == SafeLevel.VENT
             scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
@@ -370,7 +398,7 @@ class Controller:
             return
         for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
-                self._tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
+                self.memory.tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
                 scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
         if wanted != self.state:
             self._go(wanted, scene.why, events)
@@ -381,24 +409,25 @@ class Controller:
         if self.state == State.TUNE:
             self._tell_trial(why, events)
         if state != State.TUNE:
-            scene.trial = scene.trial_ended = None
+            scene.end_trial()
         if state == State.FAULT and self._gains.on_trial:
             self._revert_gains("a fault occurred during the trial", events)
         if self.state == State.FAULT:  # acknowledged, or may resume
             if not scene.acknowledged and self.fault is not None:
                 self._resume.resumed(scene.now_s)
                 events.append(told.Resumed(self.fault.name))
-            self.fault, self._tick_error = None, ""
+            self.fault = None
+            self.memory.tick_error = ""
             scene.levels.leave()
             scene.acknowledged = False
         if state == State.STANDBY:
             scene.venting = False
         scene.manual_wanted = scene.paused = False  # they end with their hold
-        self.state = state
-        self._state_since_s = math.nan
+        self.memory.state = state
+        self.memory.state_since_s = math.nan
         scene.good_since_s = scene.last_good_s = scene.highest_um = scene.highest_s = math.nan
         scene.overdue = scene.unfit = ""
-        scene.test = None
+        scene.test_memory = None
 
     def _tell_trial(self, why: str, events: list[told.Event]) -> None:
         """Report how the experiment ended: by itself, or because the state changed."""
@@ -409,10 +438,11 @@ class Controller:
 
     def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line once its words (not its numbers) have changed durably."""
-        scene = self._scene
+        scene, memory = self._scene, self.memory
         words = scene.why.translate(_NO_DIGITS)
-        if words != self._why_words:
-            self._why_words, self._why_since_s = words, scene.now_s
-        if words != self._said_why and scene.now_s - self._why_since_s >= _WHY_STANDS_S:
-            self._said_why = words
+        if words != memory.why_words:
+            memory.why_words = words
+            memory.why_since_s = scene.now_s
+        if words != memory.said_why and scene.now_s - memory.why_since_s >= _WHY_STANDS_S:
+            memory.said_why = words
             events.append(told.Why(scene.why))

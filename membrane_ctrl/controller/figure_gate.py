@@ -4,12 +4,14 @@ Loop, estimator and protections use the same figures: one that cannot be used co
 """
 
 import math
+from dataclasses import dataclass, field
 from enum import Enum
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller.jumps import JumpGate
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # The loop needs a figure younger than this, or than so many intervals of the tracking.
 _LOOP_AGE_S, _LOOP_INTERVALS = 1.0, 5
@@ -46,6 +48,22 @@ class FilmUnseen(Enum):
     NOT_ALIGNED = "the optics have not been compared with the laser yet"
 
 
+@dataclass(slots=True)
+class FigureGateState(StateNode):
+    """The newest usable figure, and the zero that its sag counts from."""
+
+    zero_um: LowPass = field(default_factory=LowPass.with_early_mean)
+    jumps: JumpGate = field(default_factory=JumpGate)
+    newest_sag_um: float = math.nan
+    newest_s: float = math.nan
+    first_tick_s: float = math.nan
+    now_s: float = math.nan
+    repeats: Count = 0
+    defect: FigureDefect | None = None  # of the newest figure
+    defect_detail: str = ""
+    waited_s: float = 0.0  # for the first figure
+
+
 class FigureGate:
     """Accepts figures, and derives the displacement that the laser would read.
 
@@ -62,7 +80,8 @@ class FigureGate:
         Why there is no displacement for the loop; None if there is one.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, memory: FigureGateState | None = None) -> None:
+        self.memory = memory or FigureGateState()
         self._tracks = config.shape.mode == "track"
         self._by_optics = config.by_optics
         self._sag_um = 1e3 * config.optics.mirror.sag_mm
@@ -70,36 +89,29 @@ class FigureGate:
         self._guard_age_s = self._loop_age_s if config.by_optics else _GUARD_AGE_S
         # A figure less certain than the band cannot hold the mirror within it.
         self._sigma_max_um = config.limits.band_um
-        self._zero_um = LowPass(_ALIGN_S, early_mean=True)
         if config.by_optics:
-            self._zero_um.reset(1e3 * config.optics.mirror.sag_mm)
-        self._jumps = JumpGate(config.limits.step_max_um)
-        self._newest_sag_um = self._newest_s = self._first_tick_s = math.nan
-        self._now_s = math.nan
-        self._repeats = 0
-        self._defect: FigureDefect | None = None
-        self._defect_detail = ""
-        self.waited_s = 0.0  # for the first figure
+            self.memory.zero_um.reset(1e3 * config.optics.mirror.sag_mm)
+        self._step_max_um = config.limits.step_max_um
         self.accepted: ShapeEstimate | None = None
 
     def take(self, now_s: float, figure: ShapeEstimate | None, laser_um: float) -> None:
         """Judge this tick's figure, if there is one; `laser_um` is NaN without a good reading."""
-        self._now_s = now_s
+        self.memory.now_s = now_s
         self.accepted = None
-        if math.isnan(self._first_tick_s):
-            self._first_tick_s = now_s
-        if math.isnan(self._newest_sag_um):
-            self.waited_s = min(now_s - self._first_tick_s, _CAMERA_STARTS_S)
+        if math.isnan(self.memory.first_tick_s):
+            self.memory.first_tick_s = now_s
+        if math.isnan(self.memory.newest_sag_um):
+            self.memory.waited_s = min(now_s - self.memory.first_tick_s, _CAMERA_STARTS_S)
         if figure is None:
             return
-        self._defect = self._find_defect(figure, now_s, laser_um)
-        if self._defect is None:
+        self.memory.defect = self._find_defect(figure, now_s, laser_um)
+        if self.memory.defect is None:
             self._accept(figure, laser_um)
 
     def _find_defect(self, figure: ShapeEstimate, now_s: float, laser_um: float) -> FigureDefect | None:
-        self._defect_detail = ""
+        self.memory.defect_detail = ""
         if figure.verdict == "rejected":
-            self._defect_detail = figure.reason
+            self.memory.defect_detail = figure.reason
             return FigureDefect.REJECTED
         if figure.kind == "full" and self._tracks:  # shows another sag than the frames after it
             return FigureDefect.ANCHOR
@@ -109,48 +121,55 @@ class FigureGate:
             return FigureDefect.OTHER_MIRROR
         if not 0.0 <= figure.sag_sigma_um <= self._sigma_max_um:
             return FigureDefect.SIGMA
-        if not figure.time_s <= now_s or figure.time_s <= self._newest_s:
+        if not figure.time_s <= now_s or figure.time_s <= self.memory.newest_s:
             return FigureDefect.TIME
-        if now_s - self._newest_s > _GUARD_AGE_S and math.isfinite(laser_um):
-            self._jumps.forget()  # the film may have moved meanwhile; the laser judges
-        if self._jumps.refuse(figure.sag_um):
-            self._defect_detail = f"by {figure.sag_um - self._newest_sag_um:+.0f} um"
+        if now_s - self.memory.newest_s > _GUARD_AGE_S and math.isfinite(laser_um):
+            self.memory.jumps.forget()  # the film may have moved meanwhile; the laser judges
+        if self.memory.jumps.refuse(figure.sag_um, self._step_max_um):
+            self.memory.defect_detail = f"by {figure.sag_um - self.memory.newest_sag_um:+.0f} um"
             return FigureDefect.JUMP
         return None
 
     def _accept(self, figure: ShapeEstimate, laser_um: float) -> None:
         self.accepted = figure
-        self._repeats = self._repeats + 1 if figure.sag_um == self._newest_sag_um else 0
-        interval_s = figure.time_s - self._newest_s
-        self._newest_sag_um, self._newest_s = figure.sag_um, figure.time_s
-        if self._by_optics or self._repeats >= _REPEATS or not math.isfinite(laser_um):
+        self.memory.repeats = self.memory.repeats + 1 if figure.sag_um == self.memory.newest_sag_um else 0
+        interval_s = figure.time_s - self.memory.newest_s
+        self.memory.newest_sag_um = figure.sag_um
+        self.memory.newest_s = figure.time_s
+        if self._by_optics or self.memory.repeats >= _REPEATS or not math.isfinite(laser_um):
             return
         at_exposure_um = figure.displacement_um if math.isfinite(figure.displacement_um) else laser_um
-        self._zero_um.update(figure.sag_um - at_exposure_um, interval_s if math.isfinite(interval_s) else 0.0)
+        over_s = interval_s if math.isfinite(interval_s) else 0.0
+        self.memory.zero_um.update(figure.sag_um - at_exposure_um, over_s, _ALIGN_S)
+
+    @property
+    def waited_s(self) -> float:
+        """How long the first figure has taken, so far."""
+        return self.memory.waited_s
 
     @property
     def newest_age_s(self) -> float:
         """Age of the newest accepted figure; NaN before the first."""
-        return self._now_s - self._newest_s
+        return self.memory.now_s - self.memory.newest_s
 
     @property
     def _sound(self) -> bool:
-        return self._repeats < _REPEATS and self._jumps.count < _JUMPED
+        return self.memory.repeats < _REPEATS and self.memory.jumps.count < _JUMPED
 
     @property
     def sag_um(self) -> float:
         """Sag by the newest figure, um; NaN if it is too old for range and limits, or repeats itself."""
-        return self._newest_sag_um if self._sound and self.newest_age_s <= self._guard_age_s else math.nan
+        return self.memory.newest_sag_um if self._sound and self.newest_age_s <= self._guard_age_s else math.nan
 
     @property
     def zero_um(self) -> float:
         """Sag at displacement 0, um; NaN until sag and laser have been compared."""
-        return self._zero_um.value
+        return self.memory.zero_um.value
 
     @property
     def guard_um(self) -> float:
         """Displacement by which range and limits may be judged, um; NaN without one."""
-        return self.sag_um - self._zero_um.value
+        return self.sag_um - self.memory.zero_um.value
 
     @property
     def loop_um(self) -> float:
@@ -162,11 +181,11 @@ class FigureGate:
         """Why `loop_um` is NaN; None if it is not."""
         if math.isfinite(self.loop_um):
             return None
-        if self._repeats >= _REPEATS:
+        if self.memory.repeats >= _REPEATS:
             return FilmUnseen.REPEATS
-        if math.isnan(self._newest_s):
+        if math.isnan(self.memory.newest_s):
             return FilmUnseen.NO_FIGURE_YET
-        return FilmUnseen.NOT_ALIGNED if math.isnan(self._zero_um.value) else FilmUnseen.NO_FIGURE
+        return FilmUnseen.NOT_ALIGNED if math.isnan(self.memory.zero_um.value) else FilmUnseen.NO_FIGURE
 
     def describe_unseen(self) -> str:
         """One phrase on why `loop_um` is NaN; empty if it is not."""
@@ -174,8 +193,10 @@ class FigureGate:
         if unseen is None:
             return ""
         age = f" for {self.newest_age_s:.1f} s" if unseen is FilmUnseen.NO_FIGURE else ""
-        if self._defect is None or unseen in (FilmUnseen.REPEATS, FilmUnseen.NOT_ALIGNED):
+        if self.memory.defect is None or unseen in (FilmUnseen.REPEATS, FilmUnseen.NOT_ALIGNED):
             return f"{unseen.value}{age}"
-        phrase = self._defect_detail if self._defect is FigureDefect.REJECTED else self._defect.value
-        detail = f" {self._defect_detail}" if self._defect is FigureDefect.JUMP else ""
+        phrase = (
+            self.memory.defect_detail if self.memory.defect is FigureDefect.REJECTED else self.memory.defect.value
+        )
+        detail = f" {self.memory.defect_detail}" if self.memory.defect is FigureDefect.JUMP else ""
         return f"{unseen.value}{age}: {phrase}{detail}"

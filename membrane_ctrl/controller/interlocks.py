@@ -8,11 +8,21 @@ the way down from standby it stays none, so that a program can be ended while a 
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from firmware_iface.roles import BenchReading
 from firmware_iface.settings import InterlockConfig
 from membrane_ctrl.model.events import Event, InterlockClosed, InterlockOpened
+from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import SafeLevel, State
+
+
+@dataclass(slots=True)
+class InterlocksState(StateNode):
+    """Masks of the open interlocks, by earlier readings."""
+
+    standby_mask: Count = 0  # open without a break since standby
+    last_mask: Count = 0  # open in the last reading, which may be of an earlier tick
 
 
 class Interlocks:
@@ -24,22 +34,24 @@ class Interlocks:
         Those that are open in this tick's reading; 0 in a tick without one.
     judged_mask : int
         Of these, the ones that are a fault in a state that judges interlocks.
-    last_mask : int
-        Those that were open in the last reading, which may be of an earlier tick.
     seen : bool
         This tick has a reading.
     """
 
-    def __init__(self, configured: tuple[InterlockConfig, ...]) -> None:
+    def __init__(self, configured: tuple[InterlockConfig, ...], memory: InterlocksState | None = None) -> None:
+        self.memory = memory or InterlocksState()
         self._names: tuple[str, ...] = tuple(interlock.name for interlock in configured)
         self._texts: tuple[str, ...] = tuple(interlock.text for interlock in configured)
         levels = (SafeLevel[interlock.safe_level.upper()] for interlock in configured)
         self._levels: tuple[SafeLevel, ...] = tuple(levels)
-        self._standby_mask = 0  # open without a break since standby
         self.open_mask = 0
         self.judged_mask = 0
-        self.last_mask = 0
         self.seen = False
+
+    @property
+    def last_mask(self) -> int:
+        """Those that were open in the last reading, which may be of an earlier tick."""
+        return self.memory.last_mask
 
     def look(self, reading: BenchReading | None, state: State) -> list[Event]:
         """Take the reading of a tick in a state; returns the events of circuits that have opened or closed."""
@@ -49,14 +61,15 @@ class Interlocks:
             self.judged_mask = 0
             return []
         self.open_mask = reading.interlocks_open & ((1 << len(self._names)) - 1)
-        changed = self.open_mask ^ self.last_mask
-        self.last_mask = self.open_mask
+        memory = self.memory
+        changed = self.open_mask ^ memory.last_mask
+        memory.last_mask = self.open_mask
         if state == State.STANDBY:
-            self._standby_mask = self.open_mask
-        self._standby_mask &= self.open_mask
+            memory.standby_mask = self.open_mask
+        memory.standby_mask &= self.open_mask
         self.judged_mask = self.open_mask
         if state == State.LOWER:
-            self.judged_mask &= ~self._standby_mask
+            self.judged_mask &= ~memory.standby_mask
         return [self._event(place) for place in _places(changed)]
 
     def _event(self, place: int) -> Event:

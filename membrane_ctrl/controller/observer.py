@@ -1,27 +1,46 @@
 """Turns a tick's inputs into the observation that safety judges and the reading that the loop may use."""
 
 import math
+from dataclasses import dataclass, field
 
 from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
-from membrane_ctrl.controller.figure_gate import FigureGate
+from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
 from membrane_ctrl.controller.jumps import JumpGate
+from membrane_ctrl.model.state_tree import StateNode
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
 
 
-class _Repeats:
+@dataclass(slots=True)
+class Repeats(StateNode):
     """How long a value has been bit-identical."""
 
-    def __init__(self) -> None:
-        self._value = self._since_s = math.nan
+    value: float = math.nan
+    since_s: float = math.nan
 
     def same_s(self, value: float, now_s: float) -> float:
         """Add a value and return the time in seconds; NaN changes nothing."""
-        if math.isfinite(value) and value != self._value:
-            self._value, self._since_s = value, now_s
-        return 0.0 if math.isnan(self._since_s) else now_s - self._since_s
+        if math.isfinite(value) and value != self.value:
+            self.value = value
+            self.since_s = now_s
+        return 0.0 if math.isnan(self.since_s) else now_s - self.since_s
+
+
+@dataclass(slots=True)
+class ObserverState(StateNode):
+    """The last inputs, as far as the next ones are judged by them."""
+
+    last_read_s: float = math.nan
+    last_advance_s: float = math.nan
+    stamp: tuple[int, float] | None = None  # sample counter and device time of the last sample
+    laser_jumps: JumpGate = field(default_factory=JumpGate)
+    gauge_jumps: JumpGate = field(default_factory=JumpGate)
+    laser_repeats: Repeats = field(default_factory=Repeats)
+    gauge_repeats: Repeats = field(default_factory=Repeats)
+    commanded: tuple[float, float] = (0.0, 0.0)  # the last two pump commands, newest first
+    figures: FigureGateState = field(default_factory=FigureGateState)
 
 
 class Observer:
@@ -45,30 +64,30 @@ class Observer:
         Those two are by figures: the laser is missing or stuck, or not used.
     figures : FigureGate
         The figures that may be used.
-    commanded : tuple of float
-        The last two pump commands, newest first.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, memory: ObserverState | None = None) -> None:
+        self.memory = memory or ObserverState()
         limits = config.limits
         self._by_optics = config.by_optics
         self._follows_optics = config.estimator.process_value != "laser" and config.shape.enabled
         self._stuck_s = limits.stuck_s
-        self.figures = FigureGate(config)
-        self._last_read_s = math.nan
-        self._last_advance_s = math.nan
-        self._stamp: tuple[int, float] | None = None
-        self._laser_jumps, self._gauge_jumps = JumpGate(limits.step_max_um), JumpGate(limits.gauge_step_max_pa)
-        self._laser_repeats, self._gauge_repeats = _Repeats(), _Repeats()
+        self._step_max_um = limits.step_max_um
+        self._gauge_step_max_pa = limits.gauge_step_max_pa
+        self.figures = FigureGate(config, self.memory.figures)
         self._laser_same_s = 0.0
-        self.commanded = (0.0, 0.0)
         self.reading: BenchReading | None = None
         self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
         self.optics_replace_laser = False
 
     def wrote(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
-        self.commanded = (command.pump_fraction, self.commanded[0])
+        self.memory.commanded = (command.pump_fraction, self.memory.commanded[0])
+
+    @property
+    def commanded(self) -> tuple[float, float]:
+        """The last two pump commands, newest first."""
+        return self.memory.commanded
 
     def look(self, inputs: tick.TickInputs, may_follow_optics: bool = True) -> None:
         """Take the tick's reading and find what is new or a jump.
@@ -77,17 +96,19 @@ class Observer:
         """
         reading = self.reading = inputs.reading
         now_s = inputs.now_s
-        if math.isnan(self._last_read_s):  # ages count from the first tick
-            self._last_read_s = self._last_advance_s = now_s
+        memory = self.memory
+        if math.isnan(memory.last_read_s):  # ages count from the first tick
+            memory.last_read_s = now_s
+            memory.last_advance_s = now_s
         if reading is not None:
-            self._last_read_s = now_s
+            memory.last_read_s = now_s
             stamp = (reading.sample_counter, reading.device_time_s)
-            if self._stamp is None or (stamp[0] != self._stamp[0] and stamp[1] != self._stamp[1]):
-                self._last_advance_s = now_s
-                self._stamp = stamp
+            if memory.stamp is None or (stamp[0] != memory.stamp[0] and stamp[1] != memory.stamp[1]):
+                memory.last_advance_s = now_s
+                memory.stamp = stamp
         uses_laser = not self._by_optics
-        self.laser_um = self._gate(reading, fresh=self._last_advance_s == now_s and uses_laser)
-        same_s = self._laser_repeats.same_s(self.laser_um, now_s)
+        self.laser_um = self._gate(reading, fresh=memory.last_advance_s == now_s and uses_laser)
+        same_s = memory.laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
         self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
@@ -96,7 +117,9 @@ class Observer:
         if replaceable and math.isnan(self.moving_laser_um):
             self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
-        self.gauge_pressure_pa = math.nan if self._gauge_jumps.refuse(gauge_pa) else gauge_pa
+        self.gauge_pressure_pa = (
+            math.nan if memory.gauge_jumps.refuse(gauge_pa, self._gauge_step_max_pa) else gauge_pa
+        )
 
     def _replace_laser_by_optics(self) -> None:
         """Let the figures show the displacement; a stuck laser stays where they show none."""
@@ -135,19 +158,19 @@ class Observer:
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         return safety.Observation(
             link_up=inputs.link_up,
-            reading_age_s=now_s - self._last_read_s,
-            advance_age_s=now_s - self._last_advance_s,
+            reading_age_s=now_s - self.memory.last_read_s,
+            advance_age_s=now_s - self.memory.last_advance_s,
             same_s=self._laser_same_s,
             displacement_um=self.displacement_um if self._by_optics else _good_quality_um(reading),
             guard_um=self.guard_um,
             laser_stuck=self.laser_stuck,
             unseen_film=self.figures.describe_unseen() if self._by_optics else "",
             displacement_valid=math.isfinite(self.displacement_um),
-            jumps=self._laser_jumps.count,
+            jumps=self.memory.laser_jumps.count,
             error_um=error_um,
             gauge_pressure_pa=gauge_pa,
             gauge_same_s=self._gauge_same_s(gauge_pa, now_s),
-            gauge_jumps=self._gauge_jumps.count,
+            gauge_jumps=self.memory.gauge_jumps.count,
             pump_mismatch=self._mismatch(reading),
             watchdog_tripped=reading.watchdog_tripped if reading else False,
             board_faults=reading.latched_faults if reading else 0,
@@ -160,13 +183,13 @@ class Observer:
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:
         """The displacement if it is finite, good, new, and within reach of the last good one; else NaN."""
         value_um = _good_quality_um(reading)
-        if not fresh or not math.isfinite(value_um) or self._laser_jumps.refuse(value_um):
+        if not fresh or not math.isfinite(value_um) or self.memory.laser_jumps.refuse(value_um, self._step_max_um):
             return math.nan
         return value_um
 
     def _gauge_same_s(self, gauge_pa: float, now_s: float) -> float:
         """How long the gauge of a taut film has repeated one value; 0 in a tick without one."""
-        same_s = self._gauge_repeats.same_s(gauge_pa, now_s)
+        same_s = self.memory.gauge_repeats.same_s(gauge_pa, now_s)
         return same_s if abs(gauge_pa) > _SLACK_PA else 0.0
 
     def _mismatch(self, reading: BenchReading | None) -> float:

@@ -7,12 +7,13 @@ out. Warmer gas and a falling barometer lift the mirror too; both are measured a
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, StatesConfig
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import Slope
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # A flow controller's zero and a tachometer's last count are below this; no pump moves gas below 0.1
 OFF_FRACTION = 0.02
@@ -29,111 +30,175 @@ _WEATHER_BLOCKS = 120
 _REST_BLOCKS = 5
 _REST_RISE_MAX_UM = 6.0
 
-# Means of displacement_um, gauge_pressure_pa, ambient_pressure_pa and air_temperature_c over a block, NaN without a
-# value, behind the time at which the block ended
-_Block = tuple[float, float, float, float, float]
+
+@dataclass(frozen=True, slots=True)
+class Block(StateNode):
+    """Means over a block, NaN without a value."""
+
+    end_s: float
+    displacement_um: float
+    gauge_pressure_pa: float
+    ambient_pressure_pa: float
+    air_temperature_c: float
+
+
+@dataclass(slots=True)
+class RunningMean(StateNode):
+    """The mean of a block so far."""
+
+    total: float = 0.0
+    count: Count = 0
+
+    def add(self, value: float) -> None:
+        """Add a value, ignoring one that is not finite."""
+        if math.isfinite(value):
+            self.total += value
+            self.count += 1
+
+    @property
+    def mean(self) -> float:
+        """The mean; NaN without a value."""
+        return self.total / self.count if self.count else math.nan
+
+
+@dataclass(slots=True)
+class OpenBlock(StateNode):
+    """The block that is being filled."""
+
+    ends_s: float = math.nan  # NaN: it begins with the next reading
+    displacement_um: RunningMean = field(default_factory=RunningMean)
+    gauge_pressure_pa: RunningMean = field(default_factory=RunningMean)
+    ambient_pressure_pa: RunningMean = field(default_factory=RunningMean)
+    air_temperature_c: RunningMean = field(default_factory=RunningMean)
+
+
+@dataclass(slots=True)
+class StandstillState(StateNode):
+    """What was observed of the pump since it was commanded off."""
+
+    blocks: deque[Block] = field(default_factory=deque)
+    open_block: OpenBlock = field(default_factory=OpenBlock)
+    on_since_s: float = math.nan  # the read-back of a pump that should have stopped
+    read_s: float = math.nan  # the last reading
+    seen_off: bool = False
+    runs_on: str = ""
+    inflow: str = ""
+    silent_s: float = 0.0
 
 
 class Standstill:
-    """Observations of the pump since it was commanded off.
+    """Observations of the pump since it was commanded off."""
 
-    Attributes
-    ----------
-    seen_off : bool
-        The newest reading, taken after a command of 0, shows the pump at rest.
-    runs_on : str
-        The read-back of a pump that should have stopped; empty if all is well.
-    inflow : str
-        Rise of the mirror although the pump is commanded off; empty if there is none.
-    silent_s : float
-        Time since the last reading.
-    """
-
-    def __init__(self, loop: LoopConfig, states: StatesConfig) -> None:
+    def __init__(self, loop: LoopConfig, states: StatesConfig, memory: StandstillState | None = None) -> None:
         self._loop, self._states = loop, states
-        self._blocks: deque[_Block] = deque(maxlen=_WEATHER_BLOCKS)
-        self._begin_block(math.nan)
-        self._on_since_s = math.nan
-        self._read_s = math.nan
-        self.seen_off = False
-        self.runs_on = self.inflow = ""
-        self.silent_s = 0.0
+        self.memory = memory or StandstillState()
+
+    @property
+    def seen_off(self) -> bool:
+        """The newest reading, taken after a command of 0, shows the pump at rest."""
+        return self.memory.seen_off
+
+    @property
+    def runs_on(self) -> str:
+        """The read-back of a pump that should have stopped; empty if all is well."""
+        return self.memory.runs_on
+
+    @property
+    def inflow(self) -> str:
+        """Rise of the mirror although the pump is commanded off; empty if there is none."""
+        return self.memory.inflow
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the last reading."""
+        return self.memory.silent_s
 
     @property
     def at_rest(self) -> bool:
         """The read-back shows the pump at rest, and for two seconds the mirror has not risen as if pumped."""
-        if not self.seen_off or len(self._blocks) < _REST_BLOCKS:
+        blocks = self.memory.blocks
+        if not self.memory.seen_off or len(blocks) < _REST_BLOCKS:
             return False
-        rise_um = self._blocks[-1][1] - self._blocks[-_REST_BLOCKS][1]
+        rise_um = blocks[-1].displacement_um - blocks[-_REST_BLOCKS].displacement_um
         return not rise_um > _REST_RISE_MAX_UM  # without a laser the read-back alone decides
 
     def look(self, now_s: float, reading: BenchReading | None, commanded: tuple[float, float], link_up: bool) -> None:
         """Note a tick's reading, and the last two pump commands before it."""
-        if reading is not None or math.isnan(self._read_s):
-            self._read_s = now_s
-        self.silent_s = now_s - self._read_s
+        memory = self.memory
+        if reading is not None or math.isnan(memory.read_s):
+            memory.read_s = now_s
+        memory.silent_s = now_s - memory.read_s
         if max(commanded) > 0.0:
-            self._blocks.clear()
-            self._begin_block(math.nan)
-            self._on_since_s = math.nan
-            self.seen_off, self.runs_on, self.inflow = False, "", ""
+            self._forget()
             return
         if not link_up:
-            self._on_since_s = math.nan  # commands sent meanwhile have not arrived
+            memory.on_since_s = math.nan  # commands sent meanwhile have not arrived
         if reading is None:
-            self.seen_off = False
+            memory.seen_off = False
             return
         self._look_at_readback(now_s, reading.pump_fraction)
         self._look_at_mirror(now_s, reading)
 
-    def _look_at_readback(self, now_s: float, readback: float) -> None:
-        self.seen_off = readback <= OFF_FRACTION  # false for NaN: an unseen pump may run
-        if self.seen_off:
-            self._on_since_s, self.runs_on = math.nan, ""
-            return
-        if math.isnan(self._on_since_s):
-            self._on_since_s = now_s
-        on_s = now_s - self._on_since_s
-        if on_s > self._states.lower_timeout_s:
-            self.runs_on = f"read-back {100.0 * readback:.0f} %, commanded off for {on_s:.1f} s"
+    def _forget(self) -> None:
+        """The pump is commanded on: nothing that was observed counts."""
+        memory = self.memory
+        memory.blocks.clear()
+        if math.isfinite(memory.open_block.ends_s):
+            memory.open_block = OpenBlock()
+        memory.on_since_s = math.nan
+        memory.seen_off = False
+        memory.runs_on = ""
+        memory.inflow = ""
 
-    def _begin_block(self, now_s: float) -> None:
-        self._block_ends_s = now_s + _BLOCK_S
-        self._sums, self._counts = [0.0] * 4, [0] * 4
+    def _look_at_readback(self, now_s: float, readback: float) -> None:
+        memory = self.memory
+        memory.seen_off = readback <= OFF_FRACTION  # false for NaN: an unseen pump may run
+        if memory.seen_off:
+            memory.on_since_s = math.nan
+            memory.runs_on = ""
+            return
+        if math.isnan(memory.on_since_s):
+            memory.on_since_s = now_s
+        on_s = now_s - memory.on_since_s
+        if on_s > self._states.lower_timeout_s:
+            memory.runs_on = f"read-back {100.0 * readback:.0f} %, commanded off for {on_s:.1f} s"
 
     def _look_at_mirror(self, now_s: float, reading: BenchReading) -> None:
-        if math.isnan(self._block_ends_s):
-            self._begin_block(now_s)
-        values = (
-            reading.displacement_um if reading.displacement_quality == 0 else math.nan,
-            reading.gauge_pressure_pa,
-            reading.ambient_pressure_pa,
-            reading.air_temperature_c,
-        )
-        for index, value in enumerate(values):
-            if math.isfinite(value):
-                self._sums[index] += value
-                self._counts[index] += 1
-        if now_s < self._block_ends_s:
+        memory, block = self.memory, self.memory.open_block
+        if math.isnan(block.ends_s):
+            block.ends_s = now_s + _BLOCK_S
+        block.displacement_um.add(reading.displacement_um if reading.displacement_quality == 0 else math.nan)
+        block.gauge_pressure_pa.add(reading.gauge_pressure_pa)
+        block.ambient_pressure_pa.add(reading.ambient_pressure_pa)
+        block.air_temperature_c.add(reading.air_temperature_c)
+        if now_s < block.ends_s:
             return
-        um, pa, ambient_pa, air_c = (
-            total / count if count else math.nan for total, count in zip(self._sums, self._counts, strict=True)
+        means = (
+            block.displacement_um.mean,
+            block.gauge_pressure_pa.mean,
+            block.ambient_pressure_pa.mean,
+            block.air_temperature_c.mean,
         )
-        self._blocks.append((now_s, um, pa, ambient_pa, air_c))
-        self._begin_block(now_s)
-        self.inflow = self._rise()
+        memory.blocks.append(Block(now_s, *means))
+        if len(memory.blocks) > _WEATHER_BLOCKS:
+            memory.blocks.popleft()
+        memory.open_block = OpenBlock(now_s + _BLOCK_S)
+        memory.inflow = self._rise()
 
     def _rise(self) -> str:
         """Rise beyond the weather's in both laser and gauge; if one is missing, the other decides."""
-        last = self._blocks[-1]
-        first = next((block for block in reversed(self._blocks) if last[0] - block[0] >= _WINDOW_S), None)
+        blocks = self.memory.blocks
+        last = blocks[-1]
+        first = next((block for block in reversed(blocks) if last.end_s - block.end_s >= _WINDOW_S), None)
         if first is None:
             return ""
-        over_s, rise_um, rise_pa = last[0] - first[0], last[1] - first[1], last[2] - first[2]
+        over_s = last.end_s - first.end_s
+        rise_um = last.displacement_um - first.displacement_um
+        rise_pa = last.gauge_pressure_pa - first.gauge_pressure_pa
         most_um = (
             _RISE_MAX_UM
-            + abs(self._loop.barometer_gain_um_per_pa) * _range(block[3] for block in self._blocks)
-            + abs(self._loop.temperature_gain_um_per_k) * _range(block[4] for block in self._blocks)
+            + abs(self._loop.barometer_gain_um_per_pa) * _range(block.ambient_pressure_pa for block in blocks)
+            + abs(self._loop.temperature_gain_um_per_k) * _range(block.air_temperature_c for block in blocks)
         )
         checks = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
         rises = [rise > most for rise, most in checks if math.isfinite(rise)]
@@ -169,6 +234,17 @@ _VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
 _PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
+@dataclass(slots=True)
+class ActuatorTestState(StateNode):
+    """What a test was begun with, and its slopes so far."""
+
+    pump: PumpConfig
+    test_vent: bool
+    speeds: dict[str, Slope]  # by part
+    before: dict[str, float] = field(default_factory=dict)  # of the first run, um/s
+    elapsed_s: float = 0.0
+
+
 class ActuatorTest:
     """Does the film respond to vent and pump? Each tick executes the commands of `part` and gives `step` its reading.
 
@@ -184,29 +260,34 @@ class ActuatorTest:
         Whether the bench has a vent and the mirror pressure to release.
     rate_hz : float
         Tick rate; fewer readings per second take longer to show a slope.
+    memory : ActuatorTestState, optional
+        Of a test in progress, with this pump and vent.
     """
 
-    def __init__(self, pump: PumpConfig, test_vent: bool, rate_hz: float) -> None:
-        self._pump = pump
+    def __init__(
+        self, pump: PumpConfig, test_vent: bool, rate_hz: float, memory: ActuatorTestState | None = None
+    ) -> None:
         # the slope's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it
         longer = (_RATE_HZ / min(rate_hz, _RATE_HZ)) ** (1 / 3)
         self._parts = [
             replace(part, measure_s=part.measure_s * longer) for part in PARTS if test_vent or part.name != "vent"
         ]
-        self._before: dict[str, float] = {}
-        self._speeds = {part.name: Slope() for part in self._parts}
-        self._elapsed_s = 0.0
+        self.memory = memory or ActuatorTestState(pump, test_vent, self._fresh_slopes())
+
+    def _fresh_slopes(self) -> dict[str, Slope]:
+        return {part.name: Slope() for part in self._parts}
 
     def again(self) -> None:
         """Start the second run; the mean of both decides if it is unclear too."""
-        self._before = {name: slope.per_s for name, slope in self._speeds.items()}
-        self._speeds = {part.name: Slope() for part in self._parts}
-        self._elapsed_s = 0.0
+        memory = self.memory
+        memory.before = {name: slope.per_s for name, slope in memory.speeds.items()}
+        memory.speeds = self._fresh_slopes()
+        memory.elapsed_s = 0.0
 
     @property
     def is_second(self) -> bool:
         """Whether the test runs for the second and last time."""
-        return bool(self._before)
+        return bool(self.memory.before)
 
     @property
     def duration_s(self) -> float:
@@ -216,7 +297,7 @@ class ActuatorTest:
     @property
     def part(self) -> Part | None:
         """The running part; None when all are done."""
-        left_s = self._elapsed_s
+        left_s = self.memory.elapsed_s
         for part in self._parts:
             if left_s < part.wait_s + part.measure_s - 1e-9:
                 return part
@@ -229,22 +310,22 @@ class ActuatorTest:
         if part is None:
             return
         before = sum(p.wait_s + p.measure_s for p in self._parts[: self._parts.index(part)])
-        if self._elapsed_s - before >= part.wait_s:
-            self._speeds[part.name].add(self._elapsed_s, displacement_um)
-        self._elapsed_s += dt_s
+        if self.memory.elapsed_s - before >= part.wait_s:
+            self.memory.speeds[part.name].add(self.memory.elapsed_s, displacement_um)
+        self.memory.elapsed_s += dt_s
 
     @property
     def leak_um_per_s(self) -> float:
         """How fast the mirror sank with the pump off and the vent closed."""
-        return max(0.0, -self._speeds["off"].per_s)
+        return max(0.0, -self.memory.speeds["off"].per_s)
 
     def failure(self) -> str:
         """What failed to respond, or in the first run to respond clearly; empty if nothing."""
-        speeds = {name: slope.per_s for name, slope in self._speeds.items()}
+        speeds = {name: slope.per_s for name, slope in self.memory.speeds.items()}
         unclear = self._judged(speeds, _VENT_CLEAR_UM_PER_S, _PUMP_CLEAR_SHARE)
-        if not (unclear and self._before):
+        if not (unclear and self.memory.before):
             return unclear  # something may have been in the beam during the first run
-        means = {name: (speed + self._before[name]) / 2 for name, speed in speeds.items()}
+        means = {name: (speed + self.memory.before[name]) / 2 for name, speed in speeds.items()}
         return self._judged(means, _VENT_LEAST_UM_PER_S, _PUMP_LEAST_SHARE)
 
     def _judged(self, speeds: dict[str, float], vent_least_um_per_s: float, pump_least_share: float) -> str:
@@ -252,7 +333,7 @@ class ActuatorTest:
             vent_um_per_s = speeds["off"] - speeds["vent"]
             if vent_um_per_s < vent_least_um_per_s:
                 return f"the vent lets the mirror down by only {vent_um_per_s:.1f} um/s"
-        expected_um_per_s = gas.PumpCurve(self._pump).flow(PARTS[-1].pump_fraction)
+        expected_um_per_s = gas.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
         rise_um_per_s = speeds["pump"] - speeds["off"]
         if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
             return f"the pump lifts the mirror by {rise_um_per_s:.1f} um/s, not by about {expected_um_per_s:.1f} um/s"

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.protection import Failure, FilmSensor, ProcessValue, find_bound
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
+from membrane_ctrl.model.state_tree import StateNode
 
 # A sensor that comes and goes within this, as a laser behind a waving hand does, is not reported.
 LOST_S = 2.0
@@ -14,13 +16,23 @@ BACK_S = 10.0
 _IS = {FilmSensor.LASER: "is", FilmSensor.OPTICS: "are", FilmSensor.GAUGE: "is"}
 
 
+@dataclass(slots=True)
+class RedundancyState(StateNode):
+    """When each sensor showed the film, and whose loss was reported."""
+
+    last_present_s: dict[FilmSensor, float] = field(default_factory=dict)
+    present_again_since_s: dict[FilmSensor, float] = field(default_factory=dict)
+    reported: list[FilmSensor] = field(default_factory=list)
+
+
 class RedundancyWatch:
     """Reports each sensor that had shown the film in this hold and does no longer.
 
     Without it the mirror is bounded by fewer independent sensors (`controller/protection.py`).
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, memory: RedundancyState | None = None) -> None:
+        self.memory = memory or RedundancyState()
         self._config = config
         self._process_value = ProcessValue(config.estimator.process_value)
         optics_lost_s = LOST_S
@@ -28,12 +40,6 @@ class RedundancyWatch:
             # A rejected cycle must not raise a notice: as long as the shape loop uses the last one.
             optics_lost_s += config.shape.fresh_s
         self._lost_s = {FilmSensor.LASER: LOST_S, FilmSensor.OPTICS: optics_lost_s, FilmSensor.GAUGE: LOST_S}
-        self._forget()
-
-    def _forget(self) -> None:
-        self._last_present_s: dict[FilmSensor, float] = {}
-        self._present_again_since_s: dict[FilmSensor, float] = {}
-        self._reported: set[FilmSensor] = set()
 
     def step(self, now_s: float, pump_may_run: bool, present: Mapping[FilmSensor, bool]) -> list[Event]:
         """One tick.
@@ -53,36 +59,36 @@ class RedundancyWatch:
         """
         events: list[Event] = []
         if not pump_may_run:
-            ended = sort_sensors(self._reported)
-            self._forget()
+            ended = sort_sensors(self.memory.reported)
+            self.memory.start_afresh()
             return [MaintenanceOver(name_notice(sensor), "the hold has ended") for sensor in ended]
         for sensor, is_present in present.items():
             if is_present:
-                self._last_present_s[sensor] = now_s
+                self.memory.last_present_s[sensor] = now_s
                 events += self._report_return(sensor, now_s)
             else:
-                self._present_again_since_s.pop(sensor, None)
+                self.memory.present_again_since_s.pop(sensor, None)
                 events += self._report_loss(sensor, now_s, present)
         return events
 
     def _report_loss(self, sensor: FilmSensor, now_s: float, present: Mapping[FilmSensor, bool]) -> list[Event]:
-        missing_s = now_s - self._last_present_s.get(sensor, math.nan)
-        if sensor in self._reported or not missing_s > self._lost_s[sensor]:
+        missing_s = now_s - self.memory.last_present_s.get(sensor, math.nan)
+        if sensor in self.memory.reported or not missing_s > self._lost_s[sensor]:
             return []
-        self._reported.add(sensor)
+        self.memory.reported.append(sensor)
         left = [other for other in FilmSensor if present.get(other, False)]
         lost = f"the {sensor.value} {_IS[sensor]} lost"
         message = f"{lost}; {self._describe(left)}. Find out why before another sensor fails"
         return [Maintenance(name_notice(sensor), message)]
 
     def _report_return(self, sensor: FilmSensor, now_s: float) -> list[Event]:
-        if sensor not in self._reported:
+        if sensor not in self.memory.reported:
             return []
-        since_s = self._present_again_since_s.setdefault(sensor, now_s)
+        since_s = self.memory.present_again_since_s.setdefault(sensor, now_s)
         if now_s - since_s < BACK_S:
             return []
-        self._reported.discard(sensor)
-        del self._present_again_since_s[sensor]
+        self.memory.reported.remove(sensor)
+        del self.memory.present_again_since_s[sensor]
         return [MaintenanceOver(name_notice(sensor), f"the {sensor.value} {_IS[sensor]} back")]
 
     def _describe(self, left: Collection[FilmSensor]) -> str:

@@ -7,11 +7,12 @@ rules the deepest level wins; the operator sees the first cause of a fault.
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.events import Fault
+from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 MOVING = frozenset({State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.TUNE})
@@ -336,6 +337,7 @@ TABLE: tuple[Rule, ...] = (
     ),
 )
 # fmt: on
+RULES: dict[int, Rule] = {rule.code: rule for rule in TABLE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,12 +349,22 @@ class Verdict:
     safe_level: SafeLevel = SafeLevel.NONE  # that it enters
 
 
+@dataclass(slots=True)
+class SafetyState(StateNode):
+    """The last M relevant ticks of each rule."""
+
+    # By the rule's code: bit i is set if the i-th last tick showed the cause. Rules without a set bit are not in it.
+    history: dict[Count, Count] = field(default_factory=dict)
+
+
 class SafetyTable:
     """Judges observations by the table; remembers only the last M relevant ticks of each rule."""
 
-    def __init__(self, limits: LimitsConfig, table: tuple[Rule, ...] = TABLE) -> None:
+    def __init__(
+        self, limits: LimitsConfig, table: tuple[Rule, ...] = TABLE, memory: SafetyState | None = None
+    ) -> None:
         self._limits, self._table = limits, table
-        self._history = [0] * len(table)
+        self.memory = memory or SafetyState()
 
     def judge(self, state: State, observation: Observation) -> Verdict:
         """Return the tripped rule with the deepest level, the first of equals. Judges all: every history is complete.
@@ -361,17 +373,19 @@ class SafetyTable:
         """
         tripped: Rule | None = None
         deepest = SafeLevel.NONE
-        for index, rule in enumerate(self._table):
+        histories = self.memory.history
+        for rule in self._table:
             if state not in rule.states:
-                self._history[index] = 0
+                histories.pop(rule.code, None)
                 continue
             broken = rule.broken(observation, self._limits)
-            if not broken and not self._history[index]:
+            if not broken and rule.code not in histories:
                 continue  # nearly always
             if rule.unseen(observation):
                 continue
-            history = ((self._history[index] << 1) | broken) & ((1 << rule.window) - 1)
-            self._history[index] = history
+            history = ((histories.pop(rule.code, 0) << 1) | broken) & ((1 << rule.window) - 1)
+            if history:
+                histories[rule.code] = history
             safe_level = rule.level_of(observation)
             if history.bit_count() >= rule.needed and safe_level > deepest:
                 tripped, deepest = rule, safe_level

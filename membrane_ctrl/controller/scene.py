@@ -1,19 +1,20 @@
 """Data that the states' handlers share: filled by commands and the tick, told as the tick's telemetry row."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import filters, inner_loop, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.machine import Finished
-from membrane_ctrl.control.experiments.trial import Trial
+from membrane_ctrl.control.experiments.trial import Trial, TrialState
 from membrane_ctrl.controller import commands, interlocks, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.state_tree import StateNode
 
 # for the record of a tick without an answer; its integers, which have no NaN, are unused
 _NO_READING = BenchReading(
@@ -33,25 +34,10 @@ _NO_READING = BenchReading(
 
 
 @dataclass(slots=True)
-class Scene:
-    """Data that the handlers share: the loop, the facts of this tick, and the decisions."""
+class SceneState(StateNode):
+    """Requests, the states' own memory, and what the next tick needs of the last one."""
 
-    config: Config
-    loop_config: LoopConfig  # present settings, after `gains`
-    pump_config: PumpConfig  # likewise
-    loop: inner_loop.InnerLoop
-    observer: Observer
-    levels: safe_levels.SafeLevels
-    standstill: pump_obeys.Standstill
-    interlocks: interlocks.Interlocks
     setpoint_um: float
-    # this tick
-    now_s: float = 0.0
-    dt_s: float = 0.02
-    state_age_s: float = 0.0  # 0 exactly in the first tick of a state
-    trim_um: float = 0.0
-    laser_doubted: bool = False  # optics and gauge contradict it
-    estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
     # requests
     hold_wanted: bool = False
     manual_wanted: bool = False
@@ -59,7 +45,7 @@ class Scene:
     manual_since_s: float = math.nan  # the last `manual` command
     mean_flow_um_per_s: float = 0.0  # the pump's mean flow when a person took over
     paused: bool = False
-    trial: Trial | None = None  # an experiment, until its end is reported
+    trial_memory: TrialState | None = None  # of an experiment, until its end is reported
     way_down: Literal["stop", "lower"] | None = None
     venting: bool = False  # while lowering, also after a `stop`
     asked_by: str = ""
@@ -75,18 +61,51 @@ class Scene:
     highest_um: float = math.nan  # filtered reading, in `inflate`
     highest_s: float = math.nan  # when the mirror was last rising
     sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, in `check`
-    test: pump_obeys.ActuatorTest | None = None
+    test_memory: pump_obeys.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0
+    # of the last tick
     last_pump_fraction: float = 0.0
-    # decisions of this tick
+    trim_um: float = 0.0
+    laser_doubted: bool = False  # optics and gauge contradict it
     output: inner_loop.LoopOutput | None = None
-    pump_fraction: float = 0.0
-    vent_fraction: float = 0.0
     why: str = ""
     overdue: str = ""
     unfit: str = ""
     finished: errors.Exit | None = None
     trial_ended: Finished | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class Scene(SceneState):
+    """Data that the handlers share: their memory, the loop, the facts of this tick, and the decisions."""
+
+    config: Config
+    loop_config: LoopConfig  # present settings, after `gains`
+    pump_config: PumpConfig  # likewise
+    loop: inner_loop.InnerLoop
+    observer: Observer
+    levels: safe_levels.SafeLevels
+    standstill: pump_obeys.Standstill
+    interlocks: interlocks.Interlocks
+    trial: Trial | None = None  # an experiment, until its end is reported
+    # this tick
+    now_s: float = 0.0
+    dt_s: float = 0.02
+    state_age_s: float = 0.0  # 0 exactly in the first tick of a state
+    estimate: CentreEstimate | None = None  # held instead of the laser's reading, if there is one
+    pump_fraction: float = 0.0
+    vent_fraction: float = 0.0
+
+    def begin_trial(self, trial: Trial) -> None:
+        """Begin an experiment."""
+        self.trial = trial
+        self.trial_memory = trial.memory
+
+    def end_trial(self) -> None:
+        """Forget an experiment whose end was reported."""
+        self.trial = None
+        self.trial_memory = None
+        self.trial_ended = None
 
     def give(self, output: inner_loop.LoopOutput) -> None:
         """Let the loop's output drive the pump, with the bleed open."""
@@ -112,6 +131,11 @@ class Scene:
         if math.isnan(self.good_since_s):
             self.good_since_s = self.now_s
         return self.now_s - self.good_since_s
+
+
+def values_of(memory: SceneState) -> dict[str, Any]:
+    """The fields of a memory by name, to make a `Scene` of."""
+    return {field.name: getattr(memory, field.name) for field in fields(SceneState)}
 
 
 # the operator's line names the sender of these commands

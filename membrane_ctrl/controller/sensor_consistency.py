@@ -3,20 +3,21 @@
 import math
 from collections import deque
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig
-from membrane_ctrl.control import film, film_health, gas, inner_loop
-from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter
+from membrane_ctrl.control import centre_estimate, film, film_health, gas, inner_loop
+from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.protection import FilmSensor
-from membrane_ctrl.controller.redundancy import RedundancyWatch
+from membrane_ctrl.controller.redundancy import RedundancyState, RedundancyWatch
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
 
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
@@ -85,75 +86,122 @@ _UNSTEADY_S = 600.0
 _VERDICTS_MAX, _OPTICS_JUMPS_MAX = 2, 5
 
 
-class RecentCount:
+@dataclass(slots=True)
+class RecentCount(StateNode):
     """Counts events of the last ten minutes."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._times_s: deque[float] = deque(maxlen=most + 1)
+    times_s: deque[float] = field(default_factory=deque)
 
-    def add(self, now_s: float) -> None:
-        """Count one."""
-        self._times_s.append(now_s)
+    def add(self, now_s: float, most: int) -> None:
+        """Count one; no more are kept than `too_many` needs."""
+        self.times_s.append(now_s)
+        if len(self.times_s) > most + 1:
+            self.times_s.popleft()
 
-    def too_many(self, now_s: float) -> bool:
+    def too_many(self, now_s: float, most: int) -> bool:
         """Whether there were more than allowed."""
-        return len(self._times_s) > self._most and now_s - self._times_s[0] <= _UNSTEADY_S
+        return len(self.times_s) > most and now_s - self.times_s[0] <= _UNSTEADY_S
+
+
+@dataclass(slots=True)
+class SensorConsistencyState(StateNode):
+    """What is remembered of the sensors from tick to tick."""
+
+    setpoint_um: float  # as last commanded
+    bleed_fraction: float
+    plausibility: film.PlausibilityState = field(default_factory=film.PlausibilityState)
+    health: film_health.FilmHealthState = field(default_factory=film_health.FilmHealthState)
+    pump: film_health.PumpHealthState = field(default_factory=film_health.PumpHealthState)
+    laser_film: film.FilmMonitorState = field(default_factory=film.FilmMonitorState)
+    optics_film: film.FilmMonitorState = field(default_factory=film.FilmMonitorState)
+    redundancy: RedundancyState = field(default_factory=RedundancyState)
+    growth: film.LeakGrowth = field(default_factory=film.LeakGrowth)
+    laser_missing_s: float = 0.0
+    doubted: bool = False
+    drift_noticed: bool = False
+    camera_s: float = -math.inf  # the newest figure
+    sag_um: float = math.nan  # by it
+    repeats: Count = 0  # of the same sag, to the last bit
+    liar: film.Liar = film.Liar.NOBODY
+    lies_s: float = 0.0
+    laser_verdicts: RecentCount = field(default_factory=RecentCount)
+    weather_s: float = 0.0
+    weather_told: bool = False
+    laser_lies: str = ""
+    camera_lies: str = ""
+    laser_gauge_apart: str = ""
+    gas_excess: str = ""
 
 
 class SensorConsistency:
     """Consulted on every tick, before safety judges.
 
+    Parameters
+    ----------
+    config : Config
+    memory : SensorConsistencyState, optional
+
     Attributes
     ----------
-    laser_lies, laser_gauge_apart, gas_excess : str
-        As in `Observation`.
-    camera_lies : str
-        Readings of laser, gauge and camera, if the camera is wrong: a reason for the shape loop.
     laser_moved : bool
         From this tick on the laser is believed in its new place; the shape loop must lock anew.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, memory: SensorConsistencyState | None = None) -> None:
+        self.memory = memory or SensorConsistencyState(config.loop.setpoint_um, config.loop.bleed_fraction)
+        memory = self.memory
         self._plausibility = film.PlausibilityCheck(
-            config.shape.disagreement_max_um, 1e3 * config.optics.mirror.sag_mm, _find_figure_lag_s(config)
+            config.shape.disagreement_max_um,
+            1e3 * config.optics.mirror.sag_mm,
+            _find_figure_lag_s(config),
+            memory.plausibility,
         )
         self._far_um = config.shape.disagreement_max_um
-        self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump))
-        self._pump = film_health.PumpHealth(config.pump.change_max)
-        self._laser_film = film.FilmMonitor(config.limits, config.optics.mirror)
-        self._optics_film = film.FilmMonitor(config.limits, config.optics.mirror, "optics")
+        self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump), memory.health)
+        self._pump = film_health.PumpHealth(config.pump.change_max, memory.pump)
+        limits, mirror = config.limits, config.optics.mirror
+        self._laser_film = film.FilmMonitor(limits, mirror, "laser", memory.laser_film)
+        self._optics_film = film.FilmMonitor(limits, mirror, "optics", memory.optics_film)
         self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
         self._follows_optics = config.estimator.process_value != "laser"
-        self._redundancy = RedundancyWatch(config)
-        self._laser_missing_s = 0.0
-        self._doubted = self._drift_noticed = False
-        self._growth = film.LeakGrowth()
+        self._redundancy = RedundancyWatch(config, memory.redundancy)
         self._leak_growth_max = config.limits.leak_growth_max
         self._fresh_s = config.shape.fresh_s
-        self._camera_s = -math.inf
-        self._sag_um, self._repeats = math.nan, 0
-        self._setpoint_um, self._bleed_fraction = config.loop.setpoint_um, config.loop.bleed_fraction
-        self._liar = film.Liar.NOBODY
-        self._lies_s, self.laser_moved = 0.0, False
-        self._laser_verdicts = RecentCount(_VERDICTS_MAX)
-        self._weather_s = 0.0
-        self._weather_told = False
-        self.laser_lies = self.camera_lies = self.laser_gauge_apart = self.gas_excess = ""
+        self.laser_moved = False
+
+    @property
+    def laser_lies(self) -> str:
+        """As in `Observation`."""
+        return self.memory.laser_lies
+
+    @property
+    def laser_gauge_apart(self) -> str:
+        """As in `Observation`."""
+        return self.memory.laser_gauge_apart
+
+    @property
+    def gas_excess(self) -> str:
+        """As in `Observation`."""
+        return self.memory.gas_excess
+
+    @property
+    def camera_lies(self) -> str:
+        """Readings of laser, gauge and camera, if the camera is wrong: a reason for the shape loop."""
+        return self.memory.camera_lies
 
     def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
         """Observe a tick and return its new events; judges only a held mirror."""
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
-        if held.setpoint_um != self._setpoint_um:
-            self._setpoint_um = held.setpoint_um
+        if held.setpoint_um != self.memory.setpoint_um:
+            self.memory.setpoint_um = held.setpoint_um
             self._health.setpoint_moved()
-        if state != State.HOLD or held.bleed_fraction != self._bleed_fraction:
-            self._bleed_fraction = held.bleed_fraction
-            self._growth.reset()
+        if state != State.HOLD or held.bleed_fraction != self.memory.bleed_fraction:
+            self.memory.bleed_fraction = held.bleed_fraction
+            self.memory.growth.reset()
         # A laser that answers now and then counts as missing; one that misses a reading now and then does not.
         change_s = -_ANSWER_COUNTS * dt_s if math.isfinite(laser_um) else dt_s
-        self._laser_missing_s = min(max(self._laser_missing_s + change_s, 0.0), _MISSING_MAX_S)
+        self.memory.laser_missing_s = min(max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S)
         self._compare_with_gauge(state, dt_s, held)
         events = self._doubt_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
@@ -161,31 +209,35 @@ class SensorConsistency:
             return events + self._rest()
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
-            self._growth.moves()
-            self.gas_excess = ""
+            self.memory.growth.moves()
+            self.memory.gas_excess = ""
         self._look_at_camera(held.figure)
         events += self._judge_weather(inputs, dt_s)
-        blind = not inputs.now_s - self._camera_s <= self._fresh_s
+        blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
-        self._lies_s = self._lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
+        self.memory.lies_s = self.memory.lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
         # A knock is over: the estimate knows the laser's new place. A laser that is knocked again and again is not.
-        self.laser_moved = self._lies_s > film.WARM_S and not self._laser_verdicts.too_many(inputs.now_s)
+        self.laser_moved = self.memory.lies_s > film.WARM_S and not self.memory.laser_verdicts.too_many(
+            inputs.now_s, _VERDICTS_MAX
+        )
         if self.laser_moved:
             self._plausibility.rebase()
             liar = film.Liar.NOBODY
-        if liar == film.Liar.LASER and self._liar != film.Liar.LASER:
-            self._laser_verdicts.add(inputs.now_s)
+        if liar == film.Liar.LASER and self.memory.liar != film.Liar.LASER:
+            self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
         events += self._judge(liar)
         if moves or state == State.SETTLE:
             return events
-        self.gas_excess = self._growth.step(held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s)
+        self.memory.gas_excess = self.memory.growth.step(
+            held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s
+        )
         events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
         return events
 
     @property
     def agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
-        return self._liar == film.Liar.NOBODY and not self.camera_lies
+        return self.memory.liar == film.Liar.NOBODY and not self.camera_lies
 
     @property
     def camera_drifts(self) -> bool:
@@ -214,16 +266,17 @@ class SensorConsistency:
 
     def _rest(self) -> list[Event]:
         """Reset: the mirror is not held, or not yet at its setpoint."""
-        self._lies_s, self.laser_moved = 0.0, False
-        self._growth.moves()
-        self.gas_excess = ""
+        self.memory.lies_s = 0.0
+        self.laser_moved = False
+        self.memory.growth.moves()
+        self.memory.gas_excess = ""
         self._plausibility.reset()
         return self._judge(film.Liar.NOBODY)
 
     @property
     def _optics_alone(self) -> bool:
         """Whether the optics show the film in the laser's place."""
-        missing = self._laser_missing_s > film.LASER_GAP_S
+        missing = self.memory.laser_missing_s > film.LASER_GAP_S
         return self._by_optics or (self._follows_optics and missing)
 
     def _compare_with_gauge(self, state: State, dt_s: float, held: HoldStatus) -> None:
@@ -234,12 +287,12 @@ class SensorConsistency:
         if state not in safety.CONNECTED:
             self._laser_film.reset()
             self._optics_film.reset()
-            self.laser_gauge_apart = ""
+            self.memory.laser_gauge_apart = ""
             return
         gauge_pa = held.gauge_pressure_pa
         by_laser = self._laser_film.step(dt_s, held.laser_um, held.trim_um, gauge_pa)
         by_optics = self._optics_film.step(dt_s, held.sag_um - self._nominal_sag_um, 0.0, gauge_pa)
-        self.laser_gauge_apart = by_optics if self._optics_alone else by_laser
+        self.memory.laser_gauge_apart = by_optics if self._optics_alone else by_laser
 
     @property
     def _film_in_use(self) -> film.FilmMonitor:
@@ -249,9 +302,9 @@ class SensorConsistency:
         """Report once that the displacement and the gauge drift apart, which climate may hide a sensor's drift in."""
         monitor = self._film_in_use
         noticed = state in safety.CONNECTED and monitor.drifting
-        if noticed == self._drift_noticed:
+        if noticed == self.memory.drift_noticed:
             return []
-        self._drift_noticed = noticed
+        self.memory.drift_noticed = noticed
         sensor = "optics" if self._optics_alone else "laser"
         if not noticed:
             return [MaintenanceOver("slow_drift", "the two are near each other again")]
@@ -273,10 +326,10 @@ class SensorConsistency:
     def _doubt_sag(self, state: State) -> list[Event]:
         """Report once that optics without a laser may have missed a jump of the film, until the next start."""
         doubted_now = self._optics_alone and self._optics_film.doubted
-        doubted = state in safety.CONNECTED and (self._doubted or doubted_now)
-        if doubted == self._doubted:
+        doubted = state in safety.CONNECTED and (self.memory.doubted or doubted_now)
+        if doubted == self.memory.doubted:
             return []
-        self._doubted = doubted
+        self.memory.doubted = doubted
         if not doubted:
             return [MaintenanceOver("sag_doubted", "the comparison begins again")]
         return [
@@ -287,17 +340,17 @@ class SensorConsistency:
         """Note when the camera last showed the film, and how often it repeated one shape bit by bit."""
         if estimate is None:
             return
-        self._camera_s = estimate.time_s
-        self._repeats = self._repeats + 1 if estimate.sag_um == self._sag_um else 0
-        self._sag_um = estimate.sag_um
+        self.memory.camera_s = estimate.time_s
+        self.memory.repeats = self.memory.repeats + 1 if estimate.sag_um == self.memory.sag_um else 0
+        self.memory.sag_um = estimate.sag_um
 
     def _most_growth(self, inputs: TickInputs) -> float:
         """Allowed growth of the leak: unlimited while the camera agrees with a laser that is there."""
-        if self._optics_alone or self._repeats >= _REPEATS:
+        if self._optics_alone or self.memory.repeats >= _REPEATS:
             return self._leak_growth_max
-        if not inputs.now_s - self._camera_s <= self._fresh_s:
+        if not inputs.now_s - self.memory.camera_s <= self._fresh_s:
             return self._leak_growth_max
-        return math.inf if self._liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
+        return math.inf if self.memory.liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
 
     def _judge_weather(self, inputs: TickInputs, dt_s: float) -> list[Event]:
         """Report once that a barometer or thermometer is implausible; the loop ignores it."""
@@ -305,25 +358,26 @@ class SensorConsistency:
         if reading is None:
             return []
         failure = gas.weather_fault(reading.ambient_pressure_pa, reading.air_temperature_c)
-        self._weather_s = self._weather_s + dt_s if bool(failure) != self._weather_told else 0.0
-        if self._weather_s < _WEATHER_STANDS_S:
+        self.memory.weather_s = self.memory.weather_s + dt_s if bool(failure) != self.memory.weather_told else 0.0
+        if self.memory.weather_s < _WEATHER_STANDS_S:
             return []
-        self._weather_told, self._weather_s = bool(failure), 0.0
+        self.memory.weather_told = bool(failure)
+        self.memory.weather_s = 0.0
         return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "the sensor is back")]
 
     def _judge(self, liar: film.Liar) -> list[Event]:
-        repeats = self._repeats >= _REPEATS
+        repeats = self.memory.repeats >= _REPEATS
         seen = str(self._plausibility.changes) if liar in (film.Liar.LASER, film.Liar.OPTICS) else ""
-        self.laser_lies = seen if liar == film.Liar.LASER else ""
+        self.memory.laser_lies = seen if liar == film.Liar.LASER else ""
         if repeats:
-            self.camera_lies = "the camera repeats one shape to the last bit: restart it"
+            self.memory.camera_lies = "the camera repeats one shape to the last bit: restart it"
         elif liar != film.Liar.OPTICS:
-            self.camera_lies = ""
+            self.memory.camera_lies = ""
         elif not self.camera_lies:  # changed numbers do not make a new reason
-            self.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
-        if liar == self._liar:
+            self.memory.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
+        if liar == self.memory.liar:
             return []
-        self._liar = liar
+        self.memory.liar = liar
         seen = str(self._plausibility.changes) if self._plausibility.watching else "compared anew from here on"
         return [Plausibility(liar.name.lower(), seen)]
 
@@ -343,6 +397,17 @@ _UNSTEADY_MESSAGE = (
 _JUMP_TAKES_S = 2.0  # until the estimate has followed a jump of the laser
 
 
+@dataclass(slots=True)
+class MountDriftState(StateNode):
+    """How far the mount has drifted."""
+
+    last_um: float = 0.0
+    drift_um: float = 0.0
+    optics_jumps: RecentCount = field(default_factory=RecentCount)
+    jump_left_s: float = 0.0  # until the estimate has followed a jump of the laser
+    beyond_limit: bool = False
+
+
 class MountDrift:
     """How far the estimate lets the laser's mount drift: as far as the shape loop's trim, `shape.trim_max_um`.
 
@@ -350,17 +415,19 @@ class MountDrift:
     mirror follows the laser, and a person decides. A jump that the estimate found to be the laser's is no drift.
     """
 
-    def __init__(self, shape: ShapeConfig) -> None:
+    def __init__(self, shape: ShapeConfig, memory: MountDriftState | None = None) -> None:
         self._most_um = shape.trim_max_um
-        self.start(0.0)
+        self.memory = memory or MountDriftState()
 
     def start(self, mount_um: float) -> None:
         """Count from a place of the mount, in um."""
-        self._last_um = mount_um
-        self._drift_um = 0.0
-        self._optics_jumps = RecentCount(_OPTICS_JUMPS_MAX)
-        self._jump_left_s = 0.0
-        self.beyond_limit = False
+        self.memory.start_afresh()
+        self.memory.last_um = mount_um
+
+    @property
+    def beyond_limit(self) -> bool:
+        """The limit is passed."""
+        return self.memory.beyond_limit
 
     def step(self, mount_um: float, jumped: Collection[Sensor], now_s: float, dt_s: float) -> list[Event]:
         """Follow the mount; returns the notice once the limit is passed, which only `start` takes back.
@@ -368,21 +435,22 @@ class MountDrift:
         `jumped`: the sensors of which the estimate has found a jump in this tick. Optics that jump again and again
         lead the estimate away in steps that each look like a knock; they are left out as well.
         """
-        moved_um = mount_um - self._last_um
-        self._last_um = mount_um
-        if self.beyond_limit:
+        memory = self.memory
+        moved_um = mount_um - memory.last_um
+        memory.last_um = mount_um
+        if memory.beyond_limit:
             return []
         if Sensor.OPTICS in jumped:
-            self._optics_jumps.add(now_s)
-            if self._optics_jumps.too_many(now_s):
-                self.beyond_limit = True
+            memory.optics_jumps.add(now_s, _OPTICS_JUMPS_MAX)
+            if memory.optics_jumps.too_many(now_s, _OPTICS_JUMPS_MAX):
+                memory.beyond_limit = True
                 return [Maintenance("optics_unsteady", _UNSTEADY_MESSAGE)]
         laser_jumped = Sensor.LASER in jumped
-        self._jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, self._jump_left_s - dt_s)
-        if self._jump_left_s == 0.0:
-            self._drift_um += moved_um
-        self.beyond_limit = abs(self._drift_um) > self._most_um
-        if not self.beyond_limit:
+        memory.jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, memory.jump_left_s - dt_s)
+        if memory.jump_left_s == 0.0:
+            memory.drift_um += moved_um
+        memory.beyond_limit = abs(memory.drift_um) > self._most_um
+        if not memory.beyond_limit:
             return []
         message = (
             f"laser and optics have drifted {self._most_um:g} um apart; which of them is not known, and the mirror "
@@ -391,30 +459,52 @@ class MountDrift:
         return [Maintenance("trim_limit", message)]
 
 
+@dataclass(slots=True)
+class HoldersState(StateNode):
+    """What the estimate remembers from tick to tick."""
+
+    centre: CentreState | None = None  # None while the estimate does not run
+    locking: bool = False
+    # Means of the mount while laser and camera agree: what the filter gave to the mount after that was the film's.
+    # The slow one serves if a slow drift of the camera is to be undone.
+    agreed_mount: LowPass = field(default_factory=LowPass)
+    slowly_agreed_mount: LowPass = field(default_factory=LowPass)
+    mount_drift: MountDriftState = field(default_factory=MountDriftState)
+    stand: centre_estimate.StandGrowthState = field(default_factory=centre_estimate.StandGrowthState)
+    stand_told: bool = False
+    told: tuple[int, ...] | None = None  # the sensors, as reported
+    news_s: float = math.nan
+    estimate: CentreEstimate | None = None
+
+
 class Holders:
     """Runs the estimate beside the states if `estimator.process_value` asks for it."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, memory: HoldersState | None = None) -> None:
+        self.memory = memory or HoldersState()
+        self._config = config.estimator
+        self._loop = config.loop
         self._wanted = config.estimator.process_value != "laser"
         self._by_optics = config.by_optics
         self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
-        self._filter = CentreFilter(config.estimator, config.loop)
+        centre = self.memory.centre
+        self._filter = None if centre is None else CentreFilter(config.estimator, config.loop, centre)
         self._tracks = config.shape.mode == "track"
-        self._running = self._locking = False
-        # While laser and camera agree, by whether a slow drift of the camera is to be undone: what the filter gave to
-        # the mount after that was the film's.
-        self._agreed_mounts = {False: LowPass(film.REFERENCE_S), True: LowPass(film.SLOW_REFERENCE_S)}
-        self._mount_drift = MountDrift(config.shape)
-        self._stand = StandGrowth(config.estimator)
-        self._stand_most_um, self._stand_told = _STAND_SHARE * config.limits.band_um, False
-        self._told: tuple[int, ...] | None = None
-        self._news_s = math.nan
-        self.estimate: CentreEstimate | None = None
+        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
+        self._stand = StandGrowth(config.estimator, self.memory.stand)
+        self._stand_most_um = _STAND_SHARE * config.limits.band_um
+
+    @property
+    def estimate(self) -> CentreEstimate | None:
+        """The newest estimate; None while it does not run."""
+        return self.memory.estimate
 
     @property
     def optics_hold(self) -> bool:
         """Whether the mirror is held without a laser: the optics see it."""
-        return self.estimate is not None and self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+        if self.memory.estimate is None or self._filter is None:
+            return False
+        return self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
 
     @property
     def optics_left_out(self) -> bool:
@@ -423,7 +513,9 @@ class Holders:
 
     def set_gains(self, loop: LoopConfig) -> None:
         """Take the feed-forward's gains from other settings."""
-        self._filter.set_gains(loop)
+        self._loop = loop
+        if self._filter is not None:
+            self._filter.set_gains(loop)
 
     def step(
         self,
@@ -438,23 +530,17 @@ class Holders:
         flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
         figures = scene.observer.figures
         if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
-            self.estimate, self._running, self._told = None, False, None
+            self._stop()
             return []
         laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
-        if not self._running:
+        if self._filter is None:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            sag_zero_um = self._find_sag_zero_um(scene)
-            self._filter.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, sag_zero_um)
-            self._running = True
-            for agreed in self._agreed_mounts.values():
-                agreed.reset(scene.trim_um)
-            self._mount_drift.start(scene.trim_um)
-            self._stand.lock()
+            self._filter = self._start(start_um, scene)
         if self._is_anchor(inputs.estimate):
             self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
-        figure = self._select_figure(figures.accepted, scene.dt_s, shape, consistency)
+        figure = self._select_figure(self._filter, figures.accepted, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
             gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan, scene.dt_s
@@ -472,15 +558,32 @@ class Holders:
             sag_time_s=figure.time_s if figure else math.nan,
             judged=consistency.judges,
         )
-        self.estimate = self._filter.step(readings, scene.dt_s)
-        scene.trim_um = self.estimate.mount_um
-        news = [*self._news(inputs.now_s, self.estimate.jumped), *self._told_of_stand()]
-        jumped = self.estimate.jumped_sensors
-        news += self._mount_drift.step(self.estimate.mount_um, jumped, inputs.now_s, scene.dt_s)
+        self.memory.estimate = estimate = self._filter.step(readings, scene.dt_s)
+        scene.trim_um = estimate.mount_um
+        news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
+        news += self._mount_drift.step(estimate.mount_um, estimate.jumped_sensors, inputs.now_s, scene.dt_s)
         if self._sees(Sensor.OPTICS):
-            sigma_um = math.hypot(self.estimate.sigma_um, self._stand.sigma_um)
-            self.estimate = replace(self.estimate, sigma_um=sigma_um)
+            sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
+            self.memory.estimate = replace(estimate, sigma_um=sigma_um)
         return news
+
+    def _stop(self) -> None:
+        self._filter = None
+        self.memory.centre = None
+        self.memory.estimate = None
+        self.memory.told = None
+
+    def _start(self, start_um: float, scene: Scene) -> CentreFilter:
+        """Begin an estimate at a displacement."""
+        memory = self.memory
+        memory.centre = CentreState()
+        begun = CentreFilter(self._config, self._loop, memory.centre)
+        begun.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._find_sag_zero_um(scene))
+        memory.agreed_mount.reset(scene.trim_um)
+        memory.slowly_agreed_mount.reset(scene.trim_um)
+        self._mount_drift.start(scene.trim_um)
+        self._stand.lock()
+        return begun
 
     def _find_sag_zero_um(self, scene: Scene) -> float:
         """Sag at true centre 0, where the optics replace the laser; NaN where they are to be locked."""
@@ -494,29 +597,37 @@ class Holders:
         return figure is not None and self._tracks and figure.kind == "full" and figure.verdict != "rejected"
 
     def _select_figure(
-        self, figure: ShapeEstimate | None, dt_s: float, shape: ShapeState, consistency: SensorConsistency
+        self,
+        centre: CentreFilter,
+        figure: ShapeEstimate | None,
+        dt_s: float,
+        shape: ShapeState,
+        consistency: SensorConsistency,
     ) -> ShapeEstimate | None:
         """The tick's figure if the filter may use it; locks the filter again where its reference ended."""
+        memory = self.memory
         off = shape == ShapeState.OFF and not self._by_optics
-        if self._locking and not off:
-            self._filter.relock()
-            self._mount_drift.start(self.estimate.mount_um if self.estimate else 0.0)
-        self._locking = off
-        if consistency.agree and self.estimate is not None:
-            for agreed in self._agreed_mounts.values():
-                agreed.update(self.estimate.mount_um, dt_s)
-        elif consistency.camera_lies and self._filter.frames and not self._by_optics:
-            self._filter.blame_optics(self._agreed_mounts[consistency.camera_drifts].value)
+        if memory.locking and not off:
+            centre.relock()
+            self._mount_drift.start(memory.estimate.mount_um if memory.estimate else 0.0)
+        memory.locking = off
+        if consistency.agree and memory.estimate is not None:
+            memory.agreed_mount.update(memory.estimate.mount_um, dt_s, film.REFERENCE_S)
+            memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, film.SLOW_REFERENCE_S)
+        elif consistency.camera_lies and centre.frames and not self._by_optics:
+            agreed = memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
+            centre.blame_optics(agreed.value)
         unusable = off or bool(consistency.camera_lies) or self._mount_drift.beyond_limit
         return None if unusable else figure
 
     def _told_of_stand(self) -> list[Event]:
         """Report once that the optics may be off by the growth of their stand, and once that a new lock ended it."""
         sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
-        far = sigma_um > self._stand_most_um / (2 if self._stand_told else 1)
-        if far == self._stand_told:
+        memory = self.memory
+        far = sigma_um > self._stand_most_um / (2 if memory.stand_told else 1)
+        if far == memory.stand_told:
             return []
-        self._stand_told = far
+        memory.stand_told = far
         stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
         if not far:
             return [MaintenanceOver("stand_growth", stands)]
@@ -524,17 +635,20 @@ class Holders:
         return [Maintenance("stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} um; {anew}")]
 
     def _sees(self, sensor: Sensor) -> bool:
-        return self.estimate is not None and self.estimate.sensors[sensor].fresh
+        estimate = self.memory.estimate
+        return estimate is not None and estimate.sensors[sensor].fresh
 
     def _news(self, now_s: float, jumped: Collection[str]) -> list[Event]:
         """Report the sensors once they have stood for a second, and every jump."""
         seeing = tuple(int(sensor) for sensor in Sensor if self._sees(sensor))
-        if seeing == self._told:
-            self._news_s = math.nan
-        elif math.isnan(self._news_s):
-            self._news_s = now_s
-        stands = not math.isnan(self._news_s) and now_s - self._news_s >= _STANDS_S
+        memory = self.memory
+        if seeing == memory.told:
+            memory.news_s = math.nan
+        elif math.isnan(memory.news_s):
+            memory.news_s = now_s
+        stands = not math.isnan(memory.news_s) and now_s - memory.news_s >= _STANDS_S
         if not stands and not jumped:
             return []
-        self._told, self._news_s = seeing, math.nan
+        memory.told = seeing
+        memory.news_s = math.nan
         return [HeldBy(", ".join(Sensor(n).name.lower() for n in seeing), ", ".join(jumped))]

@@ -56,7 +56,7 @@ def check(scene: Scene) -> State:
         why = missing or "readings come and go, or the actuator test is not done"
         scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {why}"
     if gone:
-        scene.test = None  # repeat a measurement with a gap
+        scene.test_memory = None  # repeat a measurement with a gap
         scene.why = f"checking the sensors: {missing}"
         return State.CHECK
     if scene.config.states.actuator_test:
@@ -297,27 +297,36 @@ def _asked_elsewhere(scene: Scene) -> State | None:
 
 
 def _test_actuators(scene: Scene) -> State:
-    reading = scene.observer.reading
-    if scene.test is None:
-        vents = reading is not None and math.isfinite(reading.vent_fraction)
-        tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
-        scene.test = pump_obeys.ActuatorTest(scene.pump_config, vents and tense, scene.config.loop.rate_hz)
-    scene.test.step(scene.observer.displacement_um, scene.dt_s)
-    part = scene.test.part
+    test = _running_test(scene)
+    test.step(scene.observer.displacement_um, scene.dt_s)
+    part = test.part
     if part is not None:
         scene.pump_fraction, scene.vent_fraction = part.pump_fraction, part.vent_fraction
         scene.why = f"testing the actuators: {part.name}"
         return State.CHECK
     if _missing(scene):
         return State.CHECK  # the loop starts from a reading
-    failure = scene.test.failure()
+    failure = test.failure()
     if failure:
-        if scene.test.is_second:
+        if test.is_second:
             scene.unfit = failure
         scene.why = f"the film does not respond{'' if scene.unfit else ' clearly'}: {failure}"
-        scene.test.again()
+        test.again()
         return State.CHECK
-    return _begin(scene, scene.test.leak_um_per_s)
+    return _begin(scene, test.leak_um_per_s)
+
+
+def _running_test(scene: Scene) -> pump_obeys.ActuatorTest:
+    """The actuator test, which begins with this tick if there is none."""
+    memory, rate_hz = scene.test_memory, scene.config.loop.rate_hz
+    if memory is not None:
+        return pump_obeys.ActuatorTest(memory.pump, memory.test_vent, rate_hz, memory)
+    reading = scene.observer.reading
+    vents = reading is not None and math.isfinite(reading.vent_fraction)
+    tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
+    test = pump_obeys.ActuatorTest(scene.pump_config, vents and tense, rate_hz)
+    scene.test_memory = test.memory
+    return test
 
 
 def _begin(scene: Scene, leak_um_per_s: float) -> State:

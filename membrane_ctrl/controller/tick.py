@@ -8,7 +8,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from typing import Any
@@ -60,7 +60,7 @@ class TickOutputs:
 # whether a replay is identical.
 
 # First bytes of the inputs ring's messages.
-TICK, PIECE, MEMORY = b"T", b"P", b"M"
+TICK, PIECE = b"T", b"P"
 
 _FORMATS = {
     "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
@@ -93,22 +93,18 @@ _LETTERS = {"<i8": "q", "<f8": "d", "|u1": "B", "<u4": "I"}
 _STRUCT = struct.Struct("<" + "".join(_LETTERS[RECORD[name].str] for name in RECORD.names or ()))
 assert _STRUCT.size == RECORD.itemsize
 _ROW_PLACE = len(TICK) + RECORD.itemsize
-# A slot of the ring has room for a tick. Commands and memories that are longer come in pieces.
+# A slot of the ring has room for a tick. Commands that are longer come in pieces.
 MESSAGE_BYTES = _ROW_PLACE + telemetry.ROW_BYTES
 # Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
-# What rows hold in the fields that earlier versions did not have, unless these say something
-_NO_ESTIMATE = struct.pack("<d", math.nan) * ((telemetry.SECOND_BYTES - telemetry.FIRST_BYTES) // 8)
-_NO_INTERLOCKS = struct.pack("<d", math.nan) * ((telemetry.ROW_BYTES - telemetry.SECOND_BYTES) // 8)
 _NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
 
 
-def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, memory: bytes = b"") -> list[bytes]:
+def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -> list[bytes]:
     """Messages for the inputs ring, in order; the last one is the tick.
 
-    `tick` counts from 1, `row` is the packed telemetry row of the outputs, and `memory` the controller's memory
-    before this tick, if replays are to start here.
+    `tick` counts from 1, and `row` is the packed telemetry row of the outputs.
     """
     tail = _tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
@@ -126,7 +122,7 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes, m
         output_crc(outputs, row),
         len(tail),
     )
-    return [*_pieces(MEMORY, memory), *_pieces(PIECE, tail), TICK + record + row]
+    return [*_pieces(PIECE, tail), TICK + record + row]
 
 
 def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
@@ -138,31 +134,67 @@ def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
     return TICK + record.tobytes() + row.pack()
 
 
+SNAPSHOT_BYTES_MAX = 1 << 18  # one takes 8 kB, with the estimator's covariance 70 kB
+_SNAPSHOT_HEAD = struct.Struct("<q")
+SNAPSHOT_MESSAGE_BYTES = _SNAPSHOT_HEAD.size + SNAPSHOT_BYTES_MAX
+
+
+def pack_snapshot(tick: int, snapshot: bytes) -> bytes:
+    """The message for the ring of snapshots: what the controller remembers before a tick."""
+    return _SNAPSHOT_HEAD.pack(tick) + snapshot
+
+
 def _pieces(kind: bytes, data: bytes) -> list[bytes]:
     step = MESSAGE_BYTES - len(kind)
     return [kind + data[start : start + step] for start in range(0, len(data), step)]
 
 
+_DRIVEN = struct.Struct("<2d")
+_ANSWER = struct.Struct("<q?")
+
+
 def output_crc(outputs: TickOutputs, row: bytes) -> int:
-    """Checksum of all outputs of a tick: command and row, events, end."""
-    crc = zlib.crc32(_as_in_earlier_versions(row))
-    if outputs.events or outputs.finished is not None or outputs.answers or outputs.clear_mask:
-        # a truth value, as before the mask existed: replays of older runs still give the same checksum
-        rest = [outputs.events, outputs.finished, outputs.answers, outputs.clear_mask != 0]
-        text = json.dumps(rest, default=str)
-        for former, name in telemetry.TODAY.items():  # with the names of older runs
-            text = text.replace(f" {name}=", f" {former}=")
-        crc = zlib.crc32(text.encode(), crc)
+    """Checksum of what a tick decided: command, row, kinds and numbers of its events, answers, end.
+
+    No names of columns and no sentences: a renamed column or a better sentence is no difference.
+
+    Parameters
+    ----------
+    outputs : TickOutputs
+    row : bytes
+        Doubles: the values of the columns that the run records (`ColumnChoice`).
+    """
+    command = outputs.command
+    crc = zlib.crc32(row, zlib.crc32(_DRIVEN.pack(command.pump_fraction, command.vent_fraction)))
+    for event in outputs.events:
+        numbers = event.numbers()
+        crc = zlib.crc32(event.kind.encode() + struct.pack(f"<{len(numbers)}d", *numbers), crc)
+    for number, refused in outputs.answers:
+        crc = zlib.crc32(_ANSWER.pack(number, bool(refused)), crc)
+    if outputs.finished is not None or outputs.clear_mask:
+        end = -1 if outputs.finished is None else int(outputs.finished)
+        crc = zlib.crc32(struct.pack("<2q", end, outputs.clear_mask), crc)
     return crc
 
 
-def _as_in_earlier_versions(row: bytes) -> bytes:
-    """The row without trailing fields that say nothing: as it was before these fields existed."""
-    if row[telemetry.SECOND_BYTES :] == _NO_INTERLOCKS:
-        row = row[: telemetry.SECOND_BYTES]
-        if row[telemetry.FIRST_BYTES :] == _NO_ESTIMATE:
-            row = row[: telemetry.FIRST_BYTES]
-    return row
+class ColumnChoice:
+    """The columns of a run's own schema, which the checksums of its ticks cover.
+
+    Attributes
+    ----------
+    unknown : tuple of str
+        Columns that this program does not have: no checksum of the run can be computed.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.unknown = tuple(name for name in names if name not in telemetry.COLUMN)
+        self._places = [telemetry.COLUMN[name] for name in names if name in telemetry.COLUMN]
+        self._all = self._places == list(range(len(telemetry.FIELDS)))
+
+    def pack(self, row: telemetry.TelemetryRow) -> bytes:
+        """The values of these columns, for `output_crc`."""
+        packed = row.pack()
+        return packed if self._all else np.frombuffer(packed)[self._places].tobytes()
 
 
 def _tail(inputs: TickInputs) -> bytes:
@@ -203,12 +235,12 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_es
 
 @dataclass(frozen=True, slots=True)
 class TickBatch:
-    """Ticks taken from the ring: inputs, telemetry rows, and any tails and memories by tick."""
+    """Ticks taken from the ring: inputs, telemetry rows, and any tails and snapshots by tick."""
 
     records: Records
     rows: telemetry.Rows
     tails: dict[int, bytes]
-    memories: dict[int, bytes]
+    snapshots: dict[int, bytes]
 
 
 class TickAssembler:
@@ -216,23 +248,30 @@ class TickAssembler:
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
-        self._memory: list[bytes] = []
+        self._snapshots: dict[int, bytes] = {}
+
+    def add_snapshots(self, messages: list[bytes]) -> None:
+        """Add messages of the ring of snapshots, for the ticks of this or a later call of `take`."""
+        for message in messages:
+            (tick,) = _SNAPSHOT_HEAD.unpack_from(message)
+            self._snapshots[tick] = message[_SNAPSHOT_HEAD.size :]
 
     def take(self, messages: list[bytes]) -> TickBatch:
         """Take messages in order; a tick may end in a later call than its first piece."""
         records: list[bytes] = []
         rows: list[bytes] = []
         tails: dict[int, bytes] = {}
-        memories: dict[int, bytes] = {}
+        snapshots: dict[int, bytes] = {}
         for message in messages:
             if message[:1] == TICK:
                 records.append(message[1:_ROW_PLACE])
                 rows.append(message[_ROW_PLACE:])
                 tick = int.from_bytes(message[1:9], "little")
-                for pieces, wholes in ((self._pieces, tails), (self._memory, memories)):
-                    if pieces:
-                        wholes[tick] = b"".join(pieces)
-                        pieces.clear()
+                if self._pieces:
+                    tails[tick] = b"".join(self._pieces)
+                    self._pieces.clear()
+                if tick in self._snapshots:
+                    snapshots[tick] = self._snapshots.pop(tick)
             else:
-                (self._memory if message[:1] == MEMORY else self._pieces).append(message[1:])
-        return TickBatch(np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, memories)
+                self._pieces.append(message[1:])
+        return TickBatch(np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, snapshots)

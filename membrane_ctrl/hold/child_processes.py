@@ -11,7 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
 from membrane_ctrl.model import clock, events, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child, Program, pipe
@@ -125,6 +125,7 @@ class ManagedChild:
 _TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
 _EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
 _SHAPES_KEPT = 64
+_SNAPSHOTS_KEPT = 4
 _RECORDER_CLOSES_S = 30.0
 _CHILD_STOPS_S = 3.0
 _ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
@@ -137,6 +138,7 @@ class Rings:
     telemetry: RingAddress
     events: RingAddress
     inputs: RingAddress
+    snapshots: RingAddress
     shapes: RingAddress | None
     frames: FrameAddress | None
     truth: RingAddress | None
@@ -148,11 +150,12 @@ def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Ri
     rows = stack.enter_context(ring(kept, telemetry.ROW_BYTES))
     events = stack.enter_context(ring(_EVENTS_KEPT, EVENT_BYTES))
     inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
+    snapshots = stack.enter_context(ring(_SNAPSHOTS_KEPT, SNAPSHOT_MESSAGE_BYTES))
     camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
     if not camera or not config.shape.enabled:
-        return Rings(rows, events, inputs, None, None, truth)
+        return Rings(rows, events, inputs, snapshots, None, None, truth)
     shapes = stack.enter_context(ring(_SHAPES_KEPT, ESTIMATE_BYTES_MAX))
-    return Rings(rows, events, inputs, shapes, _frames(config, stack), truth)
+    return Rings(rows, events, inputs, snapshots, shapes, _frames(config, stack), truth)
 
 
 def _frames(config: Config, stack: ExitStack) -> FrameAddress:
@@ -186,7 +189,17 @@ class ChildProcesses:
         console = ConsoleSpec(
             clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s, socket, self._keyboard
         )
-        recorder = RecorderSpec(run_dir, name, clock, config, rings.inputs, rings.events, rings.shapes, rings.frames)
+        recorder = RecorderSpec(
+            run_dir,
+            name,
+            clock,
+            config,
+            rings.inputs,
+            rings.events,
+            rings.shapes,
+            rings.frames,
+            snapshots=rings.snapshots,
+        )
         self._console = ManagedChild(
             _makes("screen", "console", 5, lambda n: replace(console, since_s=clock.now()) if n else console)
         )

@@ -250,6 +250,7 @@ def _sizes(config: schema.Config) -> dict[str, tuple[int, int]]:
     return {
         "telemetry": (ticks, telemetry.ROW_BYTES),
         "inputs": (_MESSAGES_A_TICK * ticks, tick.MESSAGE_BYTES),
+        "snapshots": (4, tick.SNAPSHOT_MESSAGE_BYTES),
         "events": (4096, 4096),
         "shapes": (256, 1 << 16),
     }
@@ -268,7 +269,7 @@ def _record(
     from membrane_ctrl.recorder import recorder, sink
 
     virtual, config = run.virtual, run.config
-    recorded = ("inputs", "events", "shapes")
+    recorded = ("inputs", "snapshots", "events", "shapes")
     with contextlib.ExitStack() as stack:
         readers = {n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n]))) for n in recorded}
         recording = sink.Recording(run_dir, name, virtual.clock, config)

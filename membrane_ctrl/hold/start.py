@@ -333,13 +333,14 @@ def _wiring(
     stack: contextlib.ExitStack,
 ) -> Wiring:
     """What the tick reads and writes, without listeners; the rings are closed with the stack."""
-    rows, events, inputs = (
+    rows, events, inputs, snapshots = (
         stack.enter_context(contextlib.closing(ring.RingWriter(address)))
-        for address in (rings.telemetry, rings.events, rings.inputs)
+        for address in (rings.telemetry, rings.events, rings.inputs, rings.snapshots)
     )
     shapes = stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))) if rings.shapes else None
     truth = twin.truth_reader() if twin else None
-    return Wiring(bench, rows, events, inputs, newest_of(shapes) if shapes else None, truth, children.reports)
+    newest_shape = newest_of(shapes) if shapes else None
+    return Wiring(bench, rows, events, inputs, snapshots, newest_shape, truth, children.reports)
 
 
 def _ask_first(

@@ -15,15 +15,15 @@ from functools import partial
 from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError, LinkWaitsError
 from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import remember
-from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_row, pack_tick
+from membrane_ctrl.controller.snapshot import take_snapshot
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_row, pack_snapshot, pack_tick
 from membrane_ctrl.model import clock, errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
 
 _CHILD_WATCH_S = 0.5  # checking on a child costs a system call
-# On average a replay runs through half of this to reach its part, in seconds; a memory costs 0.6 ms and 7 kB
-MEMORY_EVERY_S = 600.0
+# On average a replay runs through half of this to reach its part
+SNAPSHOT_EVERY_S = 300.0
 _TEXT_CUTS = (200, 20)  # characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
 
 
@@ -35,6 +35,7 @@ class Wiring:
     telemetry: RingWriter | None = None
     events: RingWriter | None = None
     inputs: RingWriter | None = None  # inputs of the ticks, for a replay
+    snapshots: RingWriter | None = None  # of the controller, where a replay may start
     shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None  # the newest since the last call
     truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
     reports: Callable[[], list[Event]] = list  # of the children since the last call
@@ -56,7 +57,7 @@ class Supervisor:
         self._link_error = ""
         self._inputs_error = self._shape_error = ""
         self._next_watch_s = 0.0
-        self._next_memory_s = MEMORY_EVERY_S
+        self._next_snapshot_s = SNAPSHOT_EVERY_S
         self._vent_fraction = 0.0
         self._broken: dict[str, str] = {}  # parts of the program that raised, with the exception
         self.ticks = 0
@@ -126,27 +127,33 @@ class Supervisor:
             truth_displacement_um=truth_um,
             truth_laser_bias_um=bias_um,
         )
-        memory = self._remember(now_s)
         outputs = self._controller.tick(inputs)
         self._vent_fraction = outputs.command.vent_fraction
         if outputs.clear_mask:
             await self._clear_board(outputs.clear_mask)
         await self._write(outputs.command)
-        self._record(inputs, outputs, memory)
+        self._record(inputs, outputs)
         for event in outputs.events:
             self.tell(event)
         for name, hear in wiring.heard.items():
             self._guarded(name, partial(hear, outputs))
+        self._record_snapshot(now_s)
         return inputs, outputs
 
-    def _remember(self, now_s: float) -> bytes:
-        """Record the controller's memory now and then, so that a replay can start there."""
-        if self._wiring.inputs is None or now_s < self._next_memory_s:
-            return b""
-        self._next_memory_s = now_s + MEMORY_EVERY_S
-        return remember(self._controller)
+    def _record_snapshot(self, now_s: float) -> None:
+        """Record now and then what the next tick starts from, so that a replay can start there.
 
-    def _record(self, inputs: TickInputs, outputs: TickOutputs, memory: bytes) -> None:
+        After the tick's write, so that the command does not wait for it.
+        """
+        if self._wiring.snapshots is None or now_s < self._next_snapshot_s:
+            return
+        self._next_snapshot_s = now_s + SNAPSHOT_EVERY_S
+        try:
+            self._wiring.snapshots.put(pack_snapshot(self.ticks + 1, take_snapshot(self._controller)))
+        except ValueError as error:  # a value of a wrong type, or too long
+            self.tell(run_events.SnapshotNotRecorded(str(error)))
+
+    def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:
         """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs, not the row."""
         if self._wiring.telemetry is None:
             return
@@ -155,7 +162,7 @@ class Supervisor:
         if self._wiring.inputs is None:
             return
         try:
-            messages = pack_tick(self.ticks, inputs, outputs, row, memory)
+            messages = pack_tick(self.ticks, inputs, outputs, row)
         except (struct.error, TypeError, ValueError) as error:
             if not self._inputs_error:
                 self._inputs_error = str(error)

@@ -73,7 +73,7 @@ class VirtualRun:
     alter : callable, optional
         Gets the time and the board's reading, returns what the controller reads.
     rings : mapping of str to RingWriter, optional
-        Where to record the run: "telemetry", "inputs", "events" and "shapes".
+        Where to record the run: "telemetry", "inputs", "snapshots", "events" and "shapes".
     """
 
     def __init__(
@@ -102,6 +102,7 @@ class VirtualRun:
             telemetry=self._rings.get("telemetry"),
             events=self._rings.get("events"),
             inputs=self._rings.get("inputs"),
+            snapshots=self._rings.get("snapshots"),
             shapes=self._newest_shape if shape else None,
             truth=self._truth,
         )

@@ -86,6 +86,12 @@ class InputsNotRecorded(Event, kind="inputs_not_recorded", level=LogLevel.WARNIN
     message: str
 
 
+class SnapshotNotRecorded(Event, kind="snapshot_not_recorded", level=LogLevel.WARNING):
+    """No replay can start at this moment; later snapshots may be recorded."""
+
+    message: str
+
+
 class ShapeUnreadable(Event, kind="shape_unreadable", level=LogLevel.WARNING):
     """A message of the acquisition is unreadable."""
 

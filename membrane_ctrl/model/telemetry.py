@@ -87,15 +87,10 @@ class TelemetryRow(ColumnValues):
         return cls(*_STRUCT.unpack(message))
 
 
-# By its name in tables, events, checksums and memories of earlier versions: a field.
-TODAY: dict[str, str] = {"rung": "safe_level"}
 FIELDS: tuple[str, ...] = tuple(COLUMNS)
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
 _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
-# Of a row of earlier versions: the first one had no estimate, the second one no interlocks.
-FIRST_BYTES = 8 * FIELDS.index("estimate_sigma_um")
-SECOND_BYTES = 8 * FIELDS.index("interlocks_open")
 
 
 # A mirror counts as settled this long after hold began and after each setpoint ramp: three closed-loop time constants

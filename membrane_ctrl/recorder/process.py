@@ -44,6 +44,7 @@ class RecorderSpec:
     events: RingAddress  # the last one has the kind "end"
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None  # for thumbnails
+    snapshots: RingAddress | None = None  # of the controller (`tick.pack_snapshot`)
     resumes: int = 0  # earlier recorders of this run that died; this one continues where they stopped
     flush_s: float = 1.0 - POLL_S  # between writes; a power cut may lose this plus one poll
 
@@ -81,7 +82,7 @@ def _record(
     from membrane_ctrl.recorder.recorder import Recorder
     from membrane_ctrl.recorder.sink import Recording
 
-    addresses = {"inputs": spec.inputs, "events": spec.events, "shapes": spec.shapes}
+    addresses = {"inputs": spec.inputs, "events": spec.events, "shapes": spec.shapes, "snapshots": spec.snapshots}
     rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
     first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)

@@ -112,7 +112,8 @@ class Recorder:
     Parameters
     ----------
     rings : dict
-        Readers by name: "inputs" (the ticks), "events" and, if the shape is measured, "shapes".
+        Readers by name: "inputs" (the ticks), "events", "snapshots" if there are any, and "shapes" if the shape is
+        measured.
     recording : Recording
         The Rerun file, without a segment yet.
     report : callable
@@ -176,6 +177,8 @@ class Recorder:
     def drain(self) -> None:
         """Take all ring messages; events go to `events.jsonl` at once."""
         self._messages += self._feeds["inputs"].drain()
+        if "snapshots" in self._feeds:  # behind the ticks: then those of all drained ticks are there
+            self._assembler.add_snapshots(self._feeds["snapshots"].drain())
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))

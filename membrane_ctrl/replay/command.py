@@ -5,14 +5,13 @@ inputs, and `incident.toml` the expected decisions. If the controller decided wr
 should have made: the test then fails until it makes them.
 """
 
-import json
 import math
 import re
 import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +20,16 @@ import tomli_w
 
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.memory import UnknownMemoryError
-from membrane_ctrl.controller.tick import Records, TickBatch
+from membrane_ctrl.controller.snapshot import UnknownSnapshotError
+from membrane_ctrl.controller.tick import ColumnChoice, Records, TickBatch
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
+from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model.state_tree import describe, to_plain
 from membrane_ctrl.replay import replay as replays
+from membrane_ctrl.replay.numbers import NUMBERS_WITHIN, RecordedRows
 from membrane_ctrl.run_files import inputs_file, run_folder, table_specs
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
@@ -45,6 +47,19 @@ class RecordedRun:
     decisions: list[replays.Decision]
     told_until_s: float  # end of the event log, if a crash truncated it
     config_damage: str = ""  # why this is not the run's configuration
+
+    @property
+    def elsewhere(self) -> str:
+        """Where its outputs were computed, if not on this processor with these libraries; else empty."""
+        recorded = self.inputs.arithmetic
+        return "" if recorded == describe_arithmetic() else recorded or "an unknown processor"
+
+    def recorded_rows(self, from_s: float) -> RecordedRows | None:
+        """Its rows, if those of this program can have other bits without being others; else None."""
+        names = [name for name in self.inputs.columns if name in telemetry.COLUMN]
+        if not self.elsewhere and len(names) == len(self.inputs.columns):
+            return None
+        return RecordedRows(open_run(self.folder).tick_blocks(["tick", *names], from_s))
 
     def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
         """Fields in which each row differs from the recorded one; None where the recording has none."""
@@ -76,12 +91,17 @@ def open_recorded(folder: Path) -> RecordedRun:
     return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
 
 
+_FIELDS_SHOWN = 10  # of a state that differs; `--json` has all
 # An event is stamped when it is reported, at the end of its tick.
 DECISION_SLACK_S = 0.5
 
 
-def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool) -> int:
+def replay_command(
+    folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool, state: bool = False
+) -> int:
     """Replay and report; exit 3 if a row or a decision differs, else 0.
+
+    `state`: print what the controller remembers at the end of the part, too.
 
     Raises InputError if the run cannot be replayed, has no such part, or (with `to_test`) the name is taken.
     """
@@ -98,10 +118,13 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
     report = _report(run, found, begin, to_s)
+    remembered = found.state if state else None
     if as_json:
-        print(json.dumps(report))
+        print(plain_json.dumps(report if remembered is None else report | {"state": to_plain(remembered)}))
     else:
         print("\n".join(_lines(report)))
+        if remembered is not None:
+            print(f"state      after the tick at {found.last_s:.3f} s:", *describe(remembered), sep="\n")
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:
@@ -112,27 +135,31 @@ def replay_command(folder: Path, from_s: float, to_s: float, to_test: str | None
             )
         target = write_incident(run, found, to_test, begin, to_s)
         print(f"written: {target}; describe the incident in its incident.toml", file=sys.stderr)
-    return int(Exit.DONE if report["verdict"] == "identical" else Exit.REJECTED)
+    return int(Exit.DONE if report["verdict"] in ("identical", "same numbers") else Exit.REJECTED)
 
 
 def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
-    """Start at the last memory before `from_s`, or at the run's start without a memory of today's layout."""
+    """Start at the last snapshot before `from_s`, or at the run's start without a snapshot of today's layout."""
     inputs = run.inputs.since(from_s)
     begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
         try:
-            return begin, replays.replay(
-                run.config, replays.recorded_ticks(inputs, begin), zernike_projection(), from_s, to_s
-            )
-        except UnknownMemoryError as error:
+            return begin, _replay(run, replays.recorded_ticks(inputs, begin), from_s, to_s)
+        except UnknownSnapshotError as error:
             print(f"from the run's start: {error}", file=sys.stderr)
     try:
-        return 1, replays.replay(run.config, replays.recorded_ticks(run.inputs), zernike_projection(), from_s, to_s)
-    except UnknownMemoryError as error:  # a memory after a gap
-        print(f"without recorded memories: {error}", file=sys.stderr)
+        return 1, _replay(run, replays.recorded_ticks(run.inputs), from_s, to_s)
+    except UnknownSnapshotError as error:  # a snapshot after a gap
+        print(f"without snapshots: {error}", file=sys.stderr)
         run.inputs.damage.clear()  # the second pass reports it again
-        ticks = replays.recorded_ticks(run.inputs, memories=False)
-        return 1, replays.replay(run.config, ticks, zernike_projection(), from_s, to_s)
+        return 1, _replay(run, replays.recorded_ticks(run.inputs, snapshots=False), from_s, to_s)
+
+
+def _replay(
+    run: RecordedRun, ticks: Iterator[replays.RecordedTick | replays.Gap], from_s: float, to_s: float
+) -> replays.Replay:
+    comparison = replays.Comparison(ColumnChoice(run.inputs.columns), run.recorded_rows(from_s))
+    return replays.replay(run.config, ticks, zernike_projection(), from_s, to_s, comparison)
 
 
 def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) -> dict[str, Any]:
@@ -148,13 +175,17 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
         "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "begin_s": found.begin_s,
-        "from_memory": begin > 1,
+        "from_snapshot": begin > 1,
         "ticks": found.ticks,
         "compared": found.compared,
+        "computed_on": run.elsewhere or None,
+        "unknown_columns": list(ColumnChoice(run.inputs.columns).unknown),
+        "near": found.near,
         "different": found.different,
         "first_different": None if first is None else {"tick": int(first.tick), "time_s": first.mono_s},
         "fields": differences[0] if differences else None,
         "decisions": decisions,
+        "state_differences": None if found.state_differences is None else asdict(found.state_differences),
         "gaps": [
             {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason} for g in found.gaps
         ],
@@ -164,19 +195,31 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
 
 def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
     """The verdict: identical only if all was compared; decisions after a gap prove nothing about the code."""
-    if found.different or (decisions_differ and not found.gaps):
+    other_numbers = found.near and found.state_differences is not None
+    if found.different or other_numbers or (decisions_differ and not found.gaps):
         return "different"
     if found.gaps or damaged or not found.compared:
         return "gaps"
-    return "identical"
+    return "same numbers" if found.near else "identical"
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
     """The report as lines of text."""
     lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
     lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
-    if report["from_memory"]:
-        lines.append(f"begins     at {report['begin_s']:.2f} s, with the controller's recorded memory")
+    if report["computed_on"]:
+        lines.append(f"           on another processor, or with other libraries: {report['computed_on']}")
+    if report["unknown_columns"]:
+        lines.append(
+            f"           with columns that this program does not have: {', '.join(report['unknown_columns'])}"
+        )
+    if report["near"]:
+        lines.append(
+            f"numbers    {report['near']} ticks have other last bits; decisions are the same, and numbers within "
+            f"{NUMBERS_WITHIN:g}, or the single precision of the record"
+        )
+    if report["from_snapshot"]:
+        lines.append(f"begins     at {report['begin_s']:.2f} s, from a snapshot of the controller")
     first = report["first_different"]
     if first is not None:
         lines.append(
@@ -191,10 +234,15 @@ def _lines(report: dict[str, Any]) -> list[str]:
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]
+    if (state := report["state_differences"]) is not None:
+        lines.append(
+            f"state      differs from the snapshot at {state['time_s']:.2f} s in {len(state['fields'])} fields:"
+        )
+        lines += [f"           {each}" for each in state["fields"][:_FIELDS_SHOWN]]
     for gap in report["gaps"]:
         lines.append(
             f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at {gap['time_s']:.2f} s: {gap['why']}; "
-            "decisions only up to the next recorded memory"
+            "decisions only up to the next snapshot"
         )
     lines += [f"damage     {sentence}" for sentence in report["damage"]]
     return lines
@@ -212,7 +260,7 @@ def write_incident(
 ) -> Path:
     """Make a test from a replay: the run's inputs up to `to_s`, and the decisions found as expectations.
 
-    It starts at the tick `begin`: the run's first, or one with a recorded controller memory.
+    It starts at the tick `begin`: the run's first, or one with a snapshot of the controller.
 
     Raises InputError if the name is invalid or taken, the folder is missing, or the test is too large for a
     repository.
@@ -227,7 +275,7 @@ def write_incident(
     folder.mkdir()
     kept = RunTables(folder)
     for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
-        kept.add_ticks(TickBatch(frame.records, _rows(frame.records), frame.tails, frame.memories))
+        kept.add_ticks(TickBatch(frame.records, _rows(frame.records), frame.tails, frame.snapshots))
         for estimate in frame.estimates.values():
             kept.add_shape(estimate)
         kept.sync()
@@ -265,7 +313,7 @@ def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Itera
         wanted = (frame.records["now_s"] <= to_s) & (frame.records["tick"] >= begin)
         ticks = set(frame.records["tick"][wanted].tolist())
         tails = {tick: tail for tick, tail in frame.tails.items() if tick in ticks}
-        memories = {tick: memory for tick, memory in frame.memories.items() if tick == begin}
+        snapshots = {tick: snapshot for tick, snapshot in frame.snapshots.items() if tick == begin}
         if ticks:
-            yield inputs_file.InputsFrame(frame.records[wanted], tails, memories, before | frame.estimates)
+            yield inputs_file.InputsFrame(frame.records[wanted], tails, snapshots, before | frame.estimates)
         before = {} if ticks else frame.estimates

@@ -1,10 +1,10 @@
 """Replay: runs the recorded inputs of a run through today's control code, on the run's own clock.
 
 A tick is a pure function of its inputs and of the ticks before it, so the same code gives identical outputs, and any
-difference is a change of the code. A replay starts with the run, or in the middle of it from a recorded memory of
-the controller (`controller_memory`). Each tick's outputs are compared by checksum. Where the record lacks ticks, the
-replayed controller misses them too: until the next recorded memory, only decisions (states, faults) are
-compared.
+difference is a change of the code. A replay starts with the run, or in the middle of it from a snapshot of
+what the controller remembered (`controller/snapshot.py`). Each tick's outputs are compared by checksum. Where the
+record lacks ticks, the replayed controller misses them too: until the next snapshot, only decisions (states, faults)
+are compared.
 """
 
 import math
@@ -16,11 +16,14 @@ import numpy as np
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import UnknownMemoryError, recall
-from membrane_ctrl.controller.tick import TickInputs, TickOutputs, output_crc, unpack_tick
+from membrane_ctrl.controller.snapshot import UnknownSnapshotError, continue_from, decode_snapshot
+from membrane_ctrl.controller.state import ControllerState
+from membrane_ctrl.controller.tick import ColumnChoice, TickInputs, TickOutputs, output_crc, unpack_tick
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered
+from membrane_ctrl.model.state_tree import find_differences
+from membrane_ctrl.replay.numbers import NUMBERS_WITHIN, RecordedRows
 from membrane_ctrl.run_files.inputs_file import InputsFrame
 
 # A shape is used in the tick it arrives in; no more than these need be kept.
@@ -45,12 +48,12 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """One recorded tick: its inputs, the checksum of its outputs, and the memory before it."""
+    """One recorded tick: its inputs, the checksum of its outputs, and the snapshot before it."""
 
     tick: int
     inputs: TickInputs
     output_crc: int
-    memory: bytes = b""
+    snapshot: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,14 @@ class Gap:
     reason: str
 
 
+@dataclass(frozen=True, slots=True)
+class StateDifferences:
+    """Where the replayed state is not the recorded one, as `place: recorded, today`."""
+
+    time_s: float
+    fields: list[str]
+
+
 @dataclass(slots=True)
 class Replay:
     """Result of a replay; rows, decisions and end are those of today's code."""
@@ -70,12 +81,33 @@ class Replay:
     begin_s: float = math.nan
     ticks: int = 0  # replayed
     compared: int = 0  # of these, bit by bit
+    near: int = 0  # of these, with other last bits
     different: int = 0  # of these
     different_rows: list[telemetry.TelemetryRow] = field(default_factory=list)  # today's, of the first of them
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     last_s: float = -math.inf
     finished: errors.Exit | None = None
+    # fields in which the state differs from the first recorded snapshot that is not the replayed state
+    state_differences: StateDifferences | None = None
+    state: ControllerState | None = None  # after the last replayed tick
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """How outputs are compared with the record.
+
+    Attributes
+    ----------
+    columns : ColumnChoice
+        Those that the checksums of the run cover.
+    rows : RecordedRows or None
+        Given if the record was made on another processor, with other libraries or with columns that this program does
+        not have: a tick with another checksum is then compared by its numbers.
+    """
+
+    columns: ColumnChoice = field(default_factory=lambda: ColumnChoice(telemetry.FIELDS))
+    rows: RecordedRows | None = None
 
 
 def replay(
@@ -84,15 +116,17 @@ def replay(
     sag_sensitivity: FloatArray,
     from_s: float = 0.0,
     to_s: float = math.inf,
+    comparison: Comparison | None = None,
 ) -> Replay:
-    """Run recorded ticks through a new controller, from the run's first or from one with a recorded memory.
+    """Run recorded ticks through a new controller, from the run's first or from one with a snapshot.
 
     The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not compared.
 
-    Raises UnknownMemoryError if today's code cannot load the record's first memory, or a tick raises after loading
-    one.
+    Raises UnknownSnapshotError if today's code cannot use the record's first snapshot, or a tick raises after
+    using one.
     """
     controller = Controller(config, sag_sensitivity)
+    comparison = comparison or Comparison()
     found = Replay()
     same_past, remembered = True, False
     for item in record:
@@ -105,39 +139,56 @@ def replay(
             break
         if not found.ticks:
             found.begin_s = item.inputs.now_s
-            if item.tick > 1 and item.memory:
-                controller, remembered = recall(item.memory, controller), True
-        elif item.memory and not same_past:
-            with suppress(UnknownMemoryError):  # then decisions only, as before
-                controller, same_past = recall(item.memory, Controller(config, sag_sensitivity)), True
-                remembered = True
+            if item.tick > 1 and item.snapshot:
+                controller, remembered = continue_from(item.snapshot, config, sag_sensitivity), True
+        elif item.snapshot and not same_past:
+            with suppress(UnknownSnapshotError):  # then decisions only, as before
+                controller = continue_from(item.snapshot, config, sag_sensitivity)
+                same_past, remembered = True, True
+        elif item.snapshot and found.state_differences is None:
+            found.state_differences = _compare_state(item, controller, comparison)
         outputs = _ticked(controller, item, remembered)
         found.ticks += 1
         found.last_s = item.inputs.now_s
         found.finished = outputs.finished
         found.decisions += decisions_of((item.inputs.now_s, event) for event in outputs.events)
         if item.inputs.now_s >= from_s and same_past:
-            _compare(item, outputs, found)
+            _compare(item, outputs, found, comparison)
+    found.state = controller.memory
     return found
 
 
+def _compare_state(item: RecordedTick, controller: Controller, comparison: Comparison) -> StateDifferences | None:
+    """Where a recorded snapshot differs from the replayed state; None if nowhere, or if it has another layout."""
+    try:
+        recorded = decode_snapshot(item.snapshot)
+    except UnknownSnapshotError:
+        return None
+    fields = find_differences(recorded, controller.memory, NUMBERS_WITHIN if comparison.rows else 0.0)
+    return StateDifferences(item.inputs.now_s, fields) if fields else None
+
+
 def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
-    """Run a tick. Ticks never raise by themselves: one that does after loading a memory proves the memory forged."""
+    """Run a tick. Ticks never raise by themselves: one that does after a snapshot proves that it was forged."""
     try:
         return controller.tick(item.inputs)
     except Exception as error:
         if not remembered:
             raise
         what = f"{type(error).__name__} at {item.inputs.now_s:.2f} s: {error}"
-        raise UnknownMemoryError(f"the recorded memory cannot be used: {what}") from None
+        raise UnknownSnapshotError(f"the snapshot cannot be used: {what}") from None
 
 
-def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay) -> None:
+def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay, comparison: Comparison) -> None:
     found.compared += 1
-    if output_crc(outputs, outputs.row.pack()) != item.output_crc:
-        found.different += 1
-        if len(found.different_rows) < _ROWS_KEPT:
-            found.different_rows.append(outputs.row)
+    if output_crc(outputs, comparison.columns.pack(outputs.row)) == item.output_crc:
+        return
+    if comparison.rows is not None and comparison.rows.find_differing(outputs.row) == ():
+        found.near += 1
+        return
+    found.different += 1
+    if len(found.different_rows) < _ROWS_KEPT:
+        found.different_rows.append(outputs.row)
 
 
 def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
@@ -151,10 +202,10 @@ def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
 
 
 def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
-    """The last tick before a time of the run that has a recorded memory; 1 if there is none."""
+    """The last tick before a time of the run that has a snapshot; 1 if there is none."""
     begin = 1
     for frame in frames:
-        for record in frame.records[np.isin(frame.records["tick"], list(frame.memories))]:
+        for record in frame.records[np.isin(frame.records["tick"], list(frame.snapshots))]:
             if record["now_s"] <= from_s:
                 begin = int(record["tick"])
         if len(frame.records) and frame.records["now_s"][-1] > from_s:
@@ -163,7 +214,7 @@ def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
 
 
 def recorded_ticks(
-    frames: Iterable[InputsFrame], begin: int = 1, memories: bool = True
+    frames: Iterable[InputsFrame], begin: int = 1, snapshots: bool = True
 ) -> Iterator[RecordedTick | Gap]:
     """Yield the ticks of a record in order from `begin` on, with a `Gap` wherever some are missing."""
     estimates: dict[float, shape_estimate.ShapeEstimate] = {}
@@ -179,8 +230,8 @@ def recorded_ticks(
             else:
                 if tick > last + 1:
                     yield Gap(last, last_s, tick - last - 1, "not recorded")
-                memory = frame.memories.get(tick, b"") if memories else b""
-                yield RecordedTick(tick, inputs, int(record["output_crc"]), memory)
+                snapshot = frame.snapshots.get(tick, b"") if snapshots else b""
+                yield RecordedTick(tick, inputs, int(record["output_crc"]), snapshot)
             last, last_s = tick, float(record["now_s"])
         while len(estimates) > _SHAPES_KEPT:
             del estimates[next(iter(estimates))]

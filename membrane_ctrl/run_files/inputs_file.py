@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 
 from membrane_ctrl.controller.tick import RECORD, SAME, Records
-from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.program import stated_program
-from membrane_ctrl.run_files import run_tables, shapes, table_specs
+from membrane_ctrl.run_files import shapes, table_specs
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 
@@ -28,11 +28,11 @@ _ROW_COLUMNS = {name: column for name, column in SAME.items() if name not in ("n
 
 @dataclass(frozen=True, slots=True)
 class InputsFrame:
-    """A part of a run: ticks by number, tails and memories by tick, shape estimates by time."""
+    """A part of a run: ticks by number, tails and snapshots by tick, shape estimates by time."""
 
     records: Records
     tails: dict[int, bytes]
-    memories: dict[int, bytes]
+    snapshots: dict[int, bytes]
     estimates: dict[float, shape_estimate.ShapeEstimate]
 
 
@@ -60,10 +60,21 @@ class InputsReader:
         """The program that wrote them, with its commit; empty if unknown."""
         return stated_program(self._reader(table_specs.INPUTS).metadata())
 
+    @property
+    def arithmetic(self) -> str:
+        """Processor and libraries that computed the recorded outputs; empty if unknown."""
+        return self._reader(table_specs.INPUTS).metadata().get("arithmetic", "")
+
+    @property
+    def columns(self) -> list[str]:
+        """The columns of telemetry that the run recorded, in their order; all of today's if unreadable."""
+        return self._reader(table_specs.TICKS).column_names() or list(telemetry.FIELDS)
+
     def __iter__(self) -> Iterator[InputsFrame]:
         """Yield all frames in order, each with the rare parts and shapes up to its end."""
         last = 0
-        rare = _Ahead((row.time_s, row) for row in self._rare())
+        rare = _Ahead((row.time_s, row) for row in self._texts(table_specs.RARE))
+        kept = _Ahead((row.time_s, row) for row in self._texts(table_specs.SNAPSHOTS))
         cycles = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.SHAPES))
         tracked = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.TRACKED))
         for block in self._records():
@@ -71,16 +82,15 @@ class InputsReader:
             if not len(records):
                 continue
             last, until_s = int(records["tick"][-1]), float(records["now_s"][-1])
-            parts = list(rare.until(until_s))
-            tails = {row.tick: row.data for row in parts if row.kind == run_tables.COMMANDS}
-            memories = {row.tick: row.data for row in parts if row.kind == run_tables.MEMORY}
+            tails = {row.tick: row.json.encode() for row in rare.until(until_s)}
+            snapshots = {row.tick: row.json.encode() for row in kept.until(until_s)}
             estimates = [*cycles.until(until_s), *tracked.until(until_s)]
-            yield InputsFrame(records, tails, memories, {found.time_s: found for found in estimates})
+            yield InputsFrame(records, tails, snapshots, {found.time_s: found for found in estimates})
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that starts at the last memory before this time of the run, or at the run's start."""
+        """A reader that starts at the last snapshot before this time of the run, or at the run's start."""
         found = InputsReader(self._folder)
-        times_s = [row.time_s for row in found._rare() if row.kind == run_tables.MEMORY and row.time_s <= time_s]
+        times_s = [found_s for found_s in found._snapshot_times_s() if found_s <= time_s]
         found.damage.clear()  # reported again when the table is read
         found._from_s = max(times_s, default=-math.inf)
         return found
@@ -108,12 +118,16 @@ class InputsReader:
                 records[name] = _numbers(same, column)[there]
             yield records
 
-    def _rare(self) -> Iterator[_Rare]:
-        names = table_specs.RARE.schema.names
-        for table in self._reader(table_specs.RARE).tables(names, self._from_s):
+    def _texts(self, spec: TableSpec) -> Iterator[_Text]:
+        names = spec.schema.names
+        for table in self._reader(spec).tables(names, self._from_s):
             if table.column_names == names:
                 rows = zip(*(table.column(name).to_pylist() for name in names), strict=True)
-                yield from (_Rare(*values) for values in rows if None not in values)
+                yield from (_Text(*values) for values in rows if None not in values)
+
+    def _snapshot_times_s(self) -> Iterator[float]:
+        for table in self._reader(table_specs.SNAPSHOTS).tables(["time_s"]):
+            yield from _numbers(table, "time_s").tolist()
 
     def _estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
         names = list(shapes.ESTIMATE_COLUMNS)
@@ -157,13 +171,12 @@ class _TickRows:
 
 
 @dataclass(frozen=True, slots=True)
-class _Rare:
-    """A row of the table `rare`."""
+class _Text:
+    """A row of the table of rare inputs or of snapshots."""
 
     time_s: float
     tick: int
-    kind: str
-    data: bytes
+    json: str
 
 
 class _Ahead(Generic[T]):

@@ -20,7 +20,6 @@ from membrane_ctrl.run_files import levels, run_folder, table_specs
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 from membrane_ctrl.run_files.table_store.writer import TableWriter
 
-COMMANDS, MEMORY = "commands", "memory"
 _MISSING_BITS = np.float64(math.nan).view(np.uint64)
 
 
@@ -57,12 +56,11 @@ class RunTables:
 
     def _add_rare(self, batch: TickBatch) -> None:
         times_s = dict(zip(batch.records["tick"].tolist(), batch.records["now_s"].tolist(), strict=True))
-        parts = [(tick, MEMORY, data) for tick, data in batch.memories.items()]
-        parts += [(tick, COMMANDS, data) for tick, data in batch.tails.items()]
-        rows = [
-            {"time_s": times_s[tick], "tick": tick, "kind": kind, "data": data} for tick, kind, data in sorted(parts)
-        ]
-        self._add_dicts(table_specs.RARE, rows)
+        for spec, parts in ((table_specs.RARE, batch.tails), (table_specs.SNAPSHOTS, batch.snapshots)):
+            rows = [
+                {"time_s": times_s[tick], "tick": tick, "json": text.decode()} for tick, text in sorted(parts.items())
+            ]
+            self._add_dicts(spec, rows)
 
     def _add_levels(self, new: levels.Columns | None) -> None:
         for window_s, rows in self._windows.finished_rows(new):

@@ -6,6 +6,7 @@ import pyarrow as pa
 
 from membrane_ctrl.controller.tick import RECORD, SAME
 from membrane_ctrl.model import shape_estimate
+from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, TelemetryColumn, unit_of
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
@@ -23,6 +24,8 @@ ROW_COLUMNS: dict[str, str] = {
 COVARIANCE_INTERVAL_S = 600.0
 # A row of these holds 3 kB, a thumbnail 10 kB.
 _SHAPE_GROUP_ROWS = 3_000
+# A row of these holds up to 70 kB, and a replay reads one.
+_SNAPSHOT_GROUP_ROWS = 50
 _THUMBNAIL_GROUP_ROWS = 500
 
 
@@ -44,7 +47,7 @@ def _spec(
 
 def with_origin(spec: TableSpec) -> TableSpec:
     """A table whose files state the running program and its commit."""
-    about = {**file_origin(FORMAT), "table": spec.name, **dict(spec.layout)}
+    about = {**file_origin(FORMAT), "table": spec.name, "arithmetic": describe_arithmetic(), **dict(spec.layout)}
     return replace(spec, schema=spec.schema.with_metadata(about))
 
 
@@ -84,11 +87,17 @@ RARE = _spec(
     [
         _field("time_s", pa.float64(), "start of the tick"),
         _field("tick", pa.int64(), "number of the tick"),
-        _field(
-            "kind", pa.string(), "commands: commands and ended tasks of the tick, as JSON; memory: before the tick"
-        ),
-        _field("data", pa.binary(), "the commands or the memory"),
+        _field("json", pa.string(), "commands and ended tasks of the tick"),
     ],
+)
+SNAPSHOTS = _spec(
+    "snapshots",
+    [
+        _field("time_s", pa.float64(), "start of the tick"),
+        _field("tick", pa.int64(), "number of the tick"),
+        _field("json", pa.string(), "what the controller remembers before the tick"),
+    ],
+    group_rows=_SNAPSHOT_GROUP_ROWS,
 )
 
 _SHAPE_TEXTS = {
@@ -195,5 +204,5 @@ THUMBNAILS = _spec(
 )
 
 ALL: tuple[TableSpec, ...] = (
-    TICKS, INPUTS, RARE, SHAPES, TRACKED, COVARIANCES, *LEVELS.values(), EVENTS, MARKS, THUMBNAILS
+    TICKS, INPUTS, RARE, SNAPSHOTS, SHAPES, TRACKED, COVARIANCES, *LEVELS.values(), EVENTS, MARKS, THUMBNAILS
 )  # fmt: skip

@@ -289,7 +289,7 @@ def test_a_drifting_mount_does_not_move_the_centre() -> None:
     estimates = _still(120.0, drifting, filtered)
     assert np.abs(_centres(estimates, 5.0)).max() < 0.12
     assert estimates[-1].mount_um - estimates[round(5.0 / DT_S)].mount_um == pytest.approx(115 * 2 / 60, abs=0.6)
-    assert filtered._noises[LASER].factor == pytest.approx(1.0, abs=0.15)
+    assert filtered.memory.noises[LASER].factor == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize("um", [1.5, 8.0])
@@ -408,7 +408,7 @@ def _follow(
 
 @pytest.mark.parametrize(("noise", "walk"), [(1.0, 1.0), (0.3, 0.3), (3.0, 0.3), (1.0, 5.0), (2.0, 0.1)])
 def test_noise_and_walk_are_learned(noise: float, walk: float) -> None:
-    reading, level = ReadingNoise(stated=False), configured_walk()
+    reading, level = ReadingNoise.of_reading(stated=False), configured_walk()
     errors = _follow(reading, level, noise, walk)
     assert math.sqrt(reading.factor) == pytest.approx(noise, rel=0.15 if walk <= noise else 0.7)
     hidden = walk < noise / 5  # a walk far below the noise is learned slowly
@@ -417,7 +417,7 @@ def test_noise_and_walk_are_learned(noise: float, walk: float) -> None:
 
 
 def test_learned_noise_stays_within_its_bounds() -> None:
-    reading, level = ReadingNoise(stated=False), configured_walk()
+    reading, level = ReadingNoise.of_reading(stated=False), configured_walk()
     for innovation in (1e3, 0.0):
         for k in range(20_000):
             reading.learn(innovation * (k % 2), 0.5, DT_S, ((level, 1.0),))
@@ -426,19 +426,19 @@ def test_learned_noise_stays_within_its_bounds() -> None:
 
 
 def test_a_level_that_hardly_showed_for_long_is_not_overturned_by_a_few_readings() -> None:
-    level = configured_walk()
+    level, bound = configured_walk(), math.log(900.0)
     for _ in range(5000):
-        level.learn(0.0, 1e-4, 0.01)
+        level.learn(0.0, 1e-4, 0.01, bound)
     for _ in range(5):
-        level.learn(4.0, 0.2, 0.01)
+        level.learn(4.0, 0.2, 0.01, bound)
     assert math.log(level.factor) < 5.1
 
 
 def test_a_ramp_is_found_with_its_begin_and_slope_and_white_noise_is_none() -> None:
-    ramp, noise = Ramp(8.0), np.random.default_rng(3).standard_normal(2000)
-    assert not any(ramp.update(float(value), 0.05 * k) for k, value in enumerate(noise[:1000]))
+    ramp, noise = Ramp(), np.random.default_rng(3).standard_normal(2000)
+    assert not any(ramp.update(float(value), 0.05 * k, 8.0) for k, value in enumerate(noise[:1000]))
     for k, value in enumerate(noise[1000:].tolist()):
-        if ramp.update(value - 0.4 * k, 50.0 + 0.05 * k):
+        if ramp.update(value - 0.4 * k, 50.0 + 0.05 * k, 8.0):
             break
     assert k < 9
     assert ramp.since_s == pytest.approx(50.0, abs=0.2)

@@ -13,63 +13,63 @@ MEMORY_S, STEP_S = 60.0, 2.0
 
 
 def test_steady_drift_is_followed_without_error() -> None:
-    tracker = DriftTracker(MEMORY_S)
+    tracker = DriftTracker()
     tracker.begin(0.0)
     worst = 0.0
     for k in range(1, 400):
         time_s = k * STEP_S
-        worst = max(worst, abs(tracker.at(time_s) - time_s / 30))
-        tracker.take(time_s / 30, time_s)
+        worst = max(worst, abs(tracker.at(time_s, MEMORY_S) - time_s / 30))
+        tracker.take(time_s / 30, time_s, MEMORY_S)
     assert worst <= 1.05 * MEMORY_S / 30 / math.e
-    assert tracker.at(800.0) == pytest.approx(800.0 / 30, abs=1e-3)
+    assert tracker.at(800.0, MEMORY_S) == pytest.approx(800.0 / 30, abs=1e-3)
 
 
 def test_late_onset_is_behind_by_rate_times_memory_over_e() -> None:
-    tracker = DriftTracker(MEMORY_S)
+    tracker = DriftTracker()
     tracker.begin(0.0)
     behind = []
     for k in range(1, 1000):
         time_s = k * STEP_S
         drift_um = max(0.0, time_s - 1000.0) / 30
-        tracker.take(drift_um, time_s)
-        behind.append(drift_um - tracker.at(time_s))
+        tracker.take(drift_um, time_s, MEMORY_S)
+        behind.append(drift_um - tracker.at(time_s, MEMORY_S))
     assert max(behind) == pytest.approx(MEMORY_S / 30 / math.e, rel=0.05)
     assert behind[-1] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_noise_comes_through_as_derived() -> None:
-    rng, tracker, seen = np.random.default_rng(5), DriftTracker(MEMORY_S), []
+    rng, tracker, seen = np.random.default_rng(5), DriftTracker(), []
     tracker.begin(0.0)
     for k in range(1, 20_000):
-        tracker.take(float(rng.standard_normal()), k * STEP_S)
-        seen.append(tracker.at(k * STEP_S))
+        tracker.take(float(rng.standard_normal()), k * STEP_S, MEMORY_S)
+        seen.append(tracker.at(k * STEP_S, MEMORY_S))
     assert np.std(seen[200:]) == pytest.approx(math.sqrt(1.25 * STEP_S / MEMORY_S), rel=0.1)
 
 
 def test_first_readings_are_damped() -> None:
     rng, first = np.random.default_rng(6), []
     for _ in range(300):
-        tracker = DriftTracker(MEMORY_S)
+        tracker = DriftTracker()
         tracker.begin(0.0)
         for k in range(1, 10):
-            tracker.take(float(rng.standard_normal()), k * STEP_S)
-        first.append(tracker.at(9 * STEP_S))
+            tracker.take(float(rng.standard_normal()), k * STEP_S, MEMORY_S)
+        first.append(tracker.at(9 * STEP_S, MEMORY_S))
     assert np.std(first) < 0.5
 
 
 def test_after_a_long_gap_the_reading_is_believed() -> None:
-    tracker = DriftTracker(MEMORY_S)
+    tracker = DriftTracker()
     tracker.begin(0.0)
-    tracker.take(0.0, 2.0)
-    tracker.take(5.0, 2000.0)
-    assert tracker.at(2000.0) == pytest.approx(5.0)
-    assert tracker.at(2010.0) == pytest.approx(5.0, abs=0.05)
+    tracker.take(0.0, 2.0, MEMORY_S)
+    tracker.take(5.0, 2000.0, MEMORY_S)
+    assert tracker.at(2000.0, MEMORY_S) == pytest.approx(5.0)
+    assert tracker.at(2010.0, MEMORY_S) == pytest.approx(5.0, abs=0.05)
 
 
 def test_rate_is_believed_for_one_memory() -> None:
     """A bump taken for a drift must not run away while there are no readings."""
-    tracker = DriftTracker(MEMORY_S)
+    tracker = DriftTracker()
     tracker.begin(0.0)
     for k in range(1, 400):
-        tracker.take(k * STEP_S / 30, k * STEP_S)
-    assert tracker.at(5000.0) == tracker.at(798.0 + MEMORY_S)
+        tracker.take(k * STEP_S / 30, k * STEP_S, MEMORY_S)
+    assert tracker.at(5000.0, MEMORY_S) == tracker.at(798.0 + MEMORY_S, MEMORY_S)

@@ -67,8 +67,8 @@ def test_gap_is_left_out() -> None:
 @pytest.mark.parametrize("by_um", [40.0, -40.0])
 def test_a_jump_is_no_loss_of_gas(by_um: float) -> None:
     """Within 0.1 s, behind the reading's filter; the leak is the flow."""
-    estimate, measured, rng = LeakEstimate(), LowPass(0.2), np.random.default_rng(5)
+    estimate, measured, rng = LeakEstimate(), LowPass(), np.random.default_rng(5)
     for k in range(round(90.0 / DT_S)):
         read_um = by_um * min(max((k * DT_S - 60.0) / 0.1, 0.0), 1.0) + rng.standard_normal()
-        estimate.update(1.24, read_um, measured.update(read_um, DT_S), DT_S)
+        estimate.update(1.24, read_um, measured.update(read_um, DT_S, 0.2), DT_S)
     assert estimate.leak_um_per_s == pytest.approx(1.24, abs=0.1)

@@ -11,7 +11,7 @@ from membrane_ctrl.control.pid import RAMP_SHARE, SetpointRamp, SetpointWeight
 
 def ramped(target_um: float, mean_flow_um_per_s: float, ticks: int, dt_s: float = 0.02) -> np.ndarray:
     ramp = SetpointRamp(3.0, 5.3)
-    ramp.value_um = 0.0
+    ramp.place(0.0)
     return np.array([ramp.advance(target_um, mean_flow_um_per_s, dt_s) for _ in range(ticks)])
 
 
@@ -57,7 +57,9 @@ def test_full_weight_is_transparent() -> None:
 
 
 def test_zero_weight_is_the_slow_lag() -> None:
-    shaper, lag = SetpointWeight(0.0, 6.5), LowPass(6.5)
+    shaper, lag = SetpointWeight(0.0, 6.5), LowPass()
     shaper.reset(0.0)
     lag.reset(0.0)
-    assert [shaper.update(1.0, 0.02) for _ in range(5)] == pytest.approx([lag.update(1.0, 0.02) for _ in range(5)])
+    assert [shaper.update(1.0, 0.02) for _ in range(5)] == pytest.approx(
+        [lag.update(1.0, 0.02, 6.5) for _ in range(5)]
+    )

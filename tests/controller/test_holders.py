@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, EstimatorConfig, TwinConfig
-from membrane_ctrl.controller import memory
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import Fault, HeldBy, Why
@@ -118,7 +118,7 @@ def test_the_depth_stays_limited_without_a_laser() -> None:
     assert faults == ["over_displacement"]
 
 
-def test_a_replay_from_memory_is_the_same_to_the_last_bit() -> None:
+def test_a_replay_from_a_snapshot_is_the_same_to_the_last_bit() -> None:
     bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump))
     run = VirtualRun(CONFIG, bench, zernike_projection(), TruthShape(bench, CONFIG, 3, 0.036))
     run._shape_period_s = 0.06
@@ -126,7 +126,7 @@ def test_a_replay_from_memory_is_the_same_to_the_last_bit() -> None:
     fresh: Controller | None = None
     for n in range(600):
         if n == 500:
-            fresh = memory.recall(memory.remember(controller), Controller(CONFIG, zernike_projection()))
+            fresh = continue_from(take_snapshot(controller), CONFIG, zernike_projection())
         tick = run.tick(() if n else (Command("hold", "a test", "it runs"),))
         assert tick is not None
         if fresh is not None:

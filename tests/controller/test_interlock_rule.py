@@ -13,7 +13,7 @@ from firmware_iface.settings import BoardInputConfig, ModbusInputConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig, StatesConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import recall, remember
+from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickAssembler, output_crc, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
@@ -376,7 +376,7 @@ def test_a_memory_remembers_what_was_open_since_standby() -> None:
     rig.circuits.open_names = {"door"}
     rig.go(1.0)
     controller = rig.run._supervisor._controller
-    again = recall(remember(controller), Controller(CONFIG, zernike_projection()))
+    again = continue_from(take_snapshot(controller), CONFIG, zernike_projection())
     inputs = replace(rig.tick(Command("vent", "ann")).inputs, commands=(Command("vent", "ann"),))
     again.tick(inputs)
     outputs = again.tick(rig.tick().inputs)

@@ -7,11 +7,11 @@ import json
 from dataclasses import asdict, replace
 
 import pytest
-from test_command_precedence import Mirror, in_state
+from test_command_precedence import CONFIG, Mirror, in_state
 
 from membrane_ctrl.controller import locks
 from membrane_ctrl.controller.commands import AT_START, TABLE, Command, Kind
-from membrane_ctrl.controller.memory import recall, remember
+from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import (
     MESSAGE_BYTES,
     TickAssembler,
@@ -20,6 +20,7 @@ from membrane_ctrl.controller.tick import (
     pack_tick,
     unpack_tick,
 )
+from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
 from membrane_ctrl.model.lock import LOCKS_MOST, WORDS, Lock, describe_locks, distinct_word, word_of_number
 from membrane_ctrl.model.run_status import RunStatus
@@ -216,8 +217,8 @@ def test_inputs_of_earlier_versions_have_neither_lock_nor_account() -> None:
 
 def test_the_locks_are_part_of_the_controllers_memory() -> None:
     mirror = locked(ANN, BOB)
-    fresh = in_state(State.STANDBY).controller
-    assert recall(remember(mirror.controller), fresh)._scene.locks == (ANN, BOB)
+    again = continue_from(take_snapshot(mirror.controller), CONFIG, zernike_projection())
+    assert again.memory.scene.locks == (ANN, BOB)
 
 
 def test_the_status_has_the_locks_until_each_is_removed() -> None:

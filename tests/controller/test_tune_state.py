@@ -16,7 +16,7 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.control.pump_drift import PumpScale
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import recall, remember
+from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
@@ -253,7 +253,7 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
         nonlocal now_s
         now_s += 5.0
         out = controller.tick(TickInputs(now_s=now_s, dt_s=0.02, reading=None, commands=commands))
-        return [event.kind for event in out.events], controller._shape._drift.memory_s
+        return [event.kind for event in out.events], controller._shape._time_constant_s
 
     def tried(shape_s: float, trial_s: float = math.nan) -> Command:
         return replace(gains(CONFIG.loop.kp_per_s, trial_s), shape_time_constant_s=shape_s)
@@ -326,7 +326,7 @@ def test_a_fault_ends_a_step() -> None:
 def test_a_step_survives_in_the_memory_of_a_controller() -> None:
     run = Stepped()
     run.told(stepped(5.0))
-    run.controller = recall(remember(run.controller), Controller(CONFIG, zernike_projection()))
+    run.controller = continue_from(take_snapshot(run.controller), CONFIG, zernike_projection())
     assert run.told(after_s=20.0) == (2.1, True)
 
 
@@ -368,7 +368,7 @@ def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recal
     assert held.of("gains_reverted")
     controller = held._run._supervisor._controller
     assert controller.pump_config == TWICE
-    again = recall(remember(controller), Controller(CONFIG, zernike_projection()))
+    again = continue_from(take_snapshot(controller), CONFIG, zernike_projection())
     assert again.pump_config == TWICE
     assert again._scene.loop._curve.flow(1.0) == 10.6
 

@@ -17,7 +17,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import LAYOUT, Recording
 from membrane_ctrl.run_files.summary import Summary
-from tests.support.virtual_record import CONFIG, kept_ticks, memory_at, write_record
+from tests.support.virtual_record import CONFIG, kept_ticks, snapshot_at, write_record
 
 RUN = "20261121T010203Z-night"
 TUNING = "20261121T010203Z-session"
@@ -31,7 +31,7 @@ def good_run(logs: Path) -> Path:
     folder = logs / RUN
     folder.mkdir(parents=True)
     ticks = kept_ticks(_SECONDS)
-    write_record(folder, ticks, memories={101: memory_at(ticks, 101)})
+    write_record(folder, ticks, snapshots={101: snapshot_at(ticks, 101)})
     (folder / "config.toml").write_text(with_comment(dump(CONFIG)))
     rows = unpack([outputs.row.pack() for _, outputs in ticks])
     summary = Summary(CONFIG)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.memory import UnknownMemoryError
+from membrane_ctrl.controller.snapshot import UnknownSnapshotError
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import errors
 from membrane_ctrl.replay.replay import Decision, recorded_ticks, replay, unmatched
@@ -48,6 +48,6 @@ def check_incident(incident: Incident) -> list[str]:
     begin = next((int(frame.records["tick"][0]) for frame in inputs if len(frame.records)), 1)
     try:
         found = replay(config, recorded_ticks(inputs, begin), zernike_projection(), 0.0, math.inf)
-    except UnknownMemoryError as error:
+    except UnknownSnapshotError as error:
         return [f"{error}: make the incident again from its run"]
     return [*inputs.damage, *unmatched(incident.expected, found.decisions, _SLACK_S)]

@@ -14,8 +14,8 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import remember
-from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_tick
+from membrane_ctrl.controller.snapshot import take_snapshot
+from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_snapshot, pack_tick
 from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
@@ -75,28 +75,29 @@ def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[Tick
     return [(tick.inputs, tick.outputs) for tick in run]
 
 
-def memory_at(ticks: list[tuple[TickInputs, TickOutputs]], tick: int) -> bytes:
-    """What the run's controller remembered before a tick."""
+def snapshot_at(ticks: list[tuple[TickInputs, TickOutputs]], tick: int) -> bytes:
+    """The snapshot of the run's controller before a tick."""
     controller = Controller(CONFIG, zernike_projection())
     for inputs, _ in ticks[: tick - 1]:
         controller.tick(inputs)
-    return remember(controller)
+    return take_snapshot(controller)
 
 
 Batch = tuple[TickBatch, list[ShapeEstimate]]
 
 
 def batches_of(
-    ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0), memories: Mapping[int, bytes] | None = None
+    ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0), snapshots: Mapping[int, bytes] | None = None
 ) -> list[Batch]:
     """What the rings bring, a second at a time; ticks of `lost` are not in it."""
     assembler, batches = TickAssembler(), []
+    assembler.add_snapshots([pack_snapshot(tick, data) for tick, data in (snapshots or {}).items()])
     for first in range(0, len(ticks), 50):
         messages: list[bytes] = []
         shapes = []
         for place, (inputs, outputs) in enumerate(ticks[first : first + 50], start=first + 1):
             if place not in lost:
-                messages += pack_tick(place, inputs, outputs, outputs.row.pack(), (memories or {}).get(place, b""))
+                messages += pack_tick(place, inputs, outputs, outputs.row.pack())
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
         batches.append((assembler.take(messages), shapes))
@@ -119,12 +120,12 @@ def write_record(
     folder: Path,
     ticks: list[tuple[TickInputs, TickOutputs]],
     lost: range = range(0),
-    memories: Mapping[int, bytes] | None = None,
+    snapshots: Mapping[int, bytes] | None = None,
     close: bool = True,
 ) -> None:
     """The run's folder: configuration, tables, events; ticks of `lost` are not in it."""
     write_head(folder, ticks)
-    write_tables(folder, batches_of(ticks, lost, memories), close)
+    write_tables(folder, batches_of(ticks, lost, snapshots), close)
 
 
 def write_head(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:

@@ -164,7 +164,7 @@ def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
 
 def time_constant_s(hold: TwinHold) -> float:
     """The shape loop's, now."""
-    return hold._run._supervisor._controller._shape._drift.memory_s
+    return hold._run._supervisor._controller._shape._time_constant_s
 
 
 @pytest.mark.campaign

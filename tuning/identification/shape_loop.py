@@ -224,10 +224,10 @@ def unfit(found: ShapeLoopFit) -> str:
 
 def _predicted(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> float:
     """Rms error with which a tracker predicts the last gaps, each from those before it."""
-    tracker = DriftTracker(memory_s)
+    tracker = DriftTracker()
     tracker.begin(float(times_s[0]))
     errors_um: list[float] = []
     for time_s, gap_um in zip(times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True):
-        errors_um.append(gap_um - tracker.at(time_s))
-        tracker.take(gap_um, time_s)
+        errors_um.append(gap_um - tracker.at(time_s, memory_s))
+        tracker.take(gap_um, time_s, memory_s)
     return float(np.sqrt(np.mean(np.square(errors_um[-last:])))) if last else math.nan

@@ -7,12 +7,13 @@ stood.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Protocol
 
 from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # An experiment's view of a tick.
 
@@ -35,7 +36,7 @@ _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class Finished(StateNode):
     """The end of an experiment: completed, or the reason and a remedy."""
 
     completed: bool
@@ -43,7 +44,7 @@ class Finished:
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class Around(StateNode):
     """The operating point of an experiment."""
 
     holding_flow_um_per_s: float  # mean flow of the loop before it
@@ -66,34 +67,48 @@ class Experiment(Protocol):
         """Flow in um/s until the next reading, or the end."""
 
 
+@dataclass(slots=True)
+class MotionState(StateNode):
+    """The two lags, and for how long the reading has been lost."""
+
+    fast: LowPass = field(default_factory=LowPass)
+    slow: LowPass = field(default_factory=LowPass)
+    lost_s: float = 0.0
+
+
 class CentreMotion:
     """Position and speed of the centre from noisy readings: two lags, and their difference over their times'."""
 
-    def __init__(self, stretch: float = 1.0, late_s: float = _LATE_S) -> None:
+    def __init__(self, stretch: float = 1.0, late_s: float = _LATE_S, memory: MotionState | None = None) -> None:
+        self.memory = memory or MotionState()
         self._fast_s, self._slow_s = stretch * FAST_S, stretch * SLOW_S
-        self._fast, self._slow = LowPass(self._fast_s), LowPass(self._slow_s)
         # from a reading to its effect: the filter is late as well
         self.coast_s = min(max(late_s, _LATE_S), _LATE_MOST_S) + self._fast_s
-        self.lost_s = 0.0
 
     def update(self, displacement_um: float, dt_s: float) -> None:
         """Take a reading; count a lost one, changing nothing else."""
+        memory = self.memory
         if not math.isfinite(displacement_um):
-            self.lost_s += dt_s
+            memory.lost_s += dt_s
             return
-        self.lost_s = 0.0
-        self._fast.update(displacement_um, dt_s)
-        self._slow.update(displacement_um, dt_s)
+        memory.lost_s = 0.0
+        memory.fast.update(displacement_um, dt_s, self._fast_s)
+        memory.slow.update(displacement_um, dt_s, self._slow_s)
+
+    @property
+    def lost_s(self) -> float:
+        """For how long the reading has been lost."""
+        return self.memory.lost_s
 
     @property
     def position_um(self) -> float:
         """Filtered reading, as late as the faster filter."""
-        return self._fast.value
+        return self.memory.fast.value
 
     @property
     def speed_um_per_s(self) -> float:
         """Filtered speed."""
-        return (self._fast.value - self._slow.value) / (self._slow_s - self._fast_s)
+        return (self.memory.fast.value - self.memory.slow.value) / (self._slow_s - self._fast_s)
 
     def noise_per_laser_um(self, rate_hz: float) -> float:
         """Standard deviation of position + `coast_s` x speed for readings of 1 um.
@@ -128,6 +143,15 @@ _BACK_MOST_S = 40.0  # with a wrong holding flow the pull ends further off
 _STRAYED = 2.0  # limits: this far off something else moves the mirror, and the loop's safety rules are needed
 
 
+@dataclass(slots=True)
+class GuardState(StateNode):
+    """The motion that the guard sees, and how the experiment has ended."""
+
+    motion: MotionState = field(default_factory=MotionState)
+    ended: Finished | None = None
+    back_s: float = 0.0  # on the way back
+
+
 class ExcursionGuard:
     """Lets an experiment run while the centre can still be stopped within the limit, then brings it back.
 
@@ -142,13 +166,18 @@ class ExcursionGuard:
     """
 
     def __init__(
-        self, experiment: Experiment, around: Around, centre_um: float, rate_hz: float, raw: bool = False
+        self,
+        experiment: Experiment,
+        around: Around,
+        centre_um: float,
+        rate_hz: float,
+        raw: bool = False,
+        memory: GuardState | None = None,
     ) -> None:
+        self.memory = memory or GuardState()
         self._experiment = experiment
         self._around, self._raw = around, raw
-        self._ended: Finished | None = None
-        self._back_s = 0.0
-        self._motion = CentreMotion(around.stretch, around.late_s)
+        self._motion = CentreMotion(around.stretch, around.late_s, self.memory.motion)
         self._centre_um = centre_um
         in_hand_um = _IN_HAND_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
@@ -166,17 +195,17 @@ class ExcursionGuard:
             lost = (
                 f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the camera), then repeat"
             )
-            return self._ended or Finished(False, lost)
+            return self.memory.ended or Finished(False, lost)
         off_um = self._motion.position_um - self._centre_um
-        if self._ended is None:
+        if self.memory.ended is None:
             found = self._guarded(off_um, measurement, dt_s)
             if self._raw or not isinstance(found, Finished):
                 return found
-            self._ended = found
-        self._back_s += dt_s
+            self.memory.ended = found
+        self.memory.back_s += dt_s
         back = abs(off_um) < _BACK_SHARE * self._limit_um
-        if back or self._back_s > _BACK_MOST_S or abs(off_um) > _STRAYED * self._limit_um:
-            return self._ended
+        if back or self.memory.back_s > _BACK_MOST_S or abs(off_um) > _STRAYED * self._limit_um:
+            return self.memory.ended
         back_um_per_s = self._around.holding_flow_um_per_s - _PULL_PER_S * off_um
         return min(max(back_um_per_s, 0.0), self._around.full_flow_um_per_s)
 
@@ -192,6 +221,14 @@ class ExcursionGuard:
         return self._experiment.step(measurement, dt_s)
 
 
+@dataclass(slots=True)
+class PatternState(StateNode):
+    """Where a pattern is."""
+
+    motion: MotionState = field(default_factory=MotionState)
+    time_s: float = 0.0
+
+
 class Patterned:
     """A flow that follows a pattern (s to um/s) about the holding flow, with a weak pull back to where it began.
 
@@ -200,23 +237,29 @@ class Patterned:
     """
 
     def __init__(
-        self, around: Around, pattern: Callable[[float], float], duration_s: float, centre_um: float
+        self,
+        around: Around,
+        pattern: Callable[[float], float],
+        duration_s: float,
+        centre_um: float,
+        memory: PatternState | None = None,
     ) -> None:
+        self.memory = memory or PatternState()
         self._around = around
         self._pattern = pattern
         self._duration_s = duration_s
         self._centre_um = centre_um
-        self._motion = CentreMotion(around.stretch, around.late_s)
-        self._time_s = 0.0
+        self._motion = CentreMotion(around.stretch, around.late_s, self.memory.motion)
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """One tick of the pattern."""
-        if self._time_s >= self._duration_s:
+        memory = self.memory
+        if memory.time_s >= self._duration_s:
             return Finished(True, "done")
         self._motion.update(measurement.displacement_um, dt_s)
         back_um_per_s = _PULL_PER_S * (self._centre_um - self._motion.position_um)
-        pattern_um_per_s = self._pattern(self._time_s)
-        self._time_s += dt_s
+        pattern_um_per_s = self._pattern(memory.time_s)
+        memory.time_s += dt_s
         return self._around.within(self._around.holding_flow_um_per_s + pattern_um_per_s + back_um_per_s)
 
 
@@ -256,64 +299,97 @@ _PATIENCE_S = 90.0
 NO_ANSWER = "the mirror did not"  # begins the reason of a relay that waited in vain
 
 
+@dataclass(slots=True)
+class HalfCycle(StateNode):
+    """What a relay has found in one direction."""
+
+    amplitude_um_per_s: float
+    speed_um_per_s: float
+
+
+@dataclass(slots=True)
+class RelayState(StateNode):
+    """Where a relay is, and the amplitudes that it has found."""
+
+    up: HalfCycle
+    down: HalfCycle
+    motion: MotionState = field(default_factory=MotionState)
+    rises: bool = True
+    time_s: float = 0.0
+    since_switch_s: float = 0.0
+    overshoot_um: float = 0.0
+    at_centre_s: float = math.nan
+    crossings: Count = 0
+
+    @property
+    def direction(self) -> int:
+        """1 upwards, -1 downwards."""
+        return 1 if self.rises else -1
+
+
+def begin_relay(around: Around) -> RelayState:
+    """The state of a relay that begins."""
+    first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
+    return RelayState(HalfCycle(first, first), HalfCycle(first, first))
+
+
 class Relay:
     """Switches between a high and a low flow whenever the centre leaves a band about `centre_um`."""
 
-    def __init__(self, around: Around, centre_um: float, duration_s: float = 120.0) -> None:
+    def __init__(
+        self, around: Around, centre_um: float, duration_s: float = 120.0, memory: RelayState | None = None
+    ) -> None:
+        self.memory = memory or begin_relay(around)
         self._around = around
         self._centre_um = centre_um
         self._duration_s = duration_s
         self._threshold_um = THRESHOLD_SHARE * around.limit_um
-        self._motion = CentreMotion(around.stretch, around.late_s)
-        first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
-        self._amplitudes_um_per_s = {1: first, -1: first}
-        self._speeds_um_per_s = {1: first, -1: first}
-        self._direction = 1
-        self._time_s = self._since_switch_s = 0.0
-        self._overshoot_um = 0.0
-        self._at_centre_s = math.nan
-        self.crossings = 0
+        self._motion = CentreMotion(around.stretch, around.late_s, self.memory.motion)
+
+    @property
+    def crossings(self) -> int:
+        """How often it has switched."""
+        return self.memory.crossings
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
         """One tick of the relay."""
+        memory = self.memory
         self._motion.update(measurement.displacement_um, dt_s)
-        if self._time_s >= self._duration_s:
-            return Finished(True, f"{self.crossings} crossings")
-        self._time_s += dt_s
-        self._since_switch_s += dt_s
+        if memory.time_s >= self._duration_s:
+            return Finished(True, f"{memory.crossings} crossings")
+        memory.time_s += dt_s
+        memory.since_switch_s += dt_s
         off_um = self._motion.position_um - self._centre_um
         # beyond the threshold on the side it came from, for the delay after a switch
-        self._overshoot_um = max(self._overshoot_um, -self._direction * off_um - self._threshold_um)
-        if math.isnan(self._at_centre_s) and self._direction * off_um > 0:
-            self._at_centre_s = self._time_s
-        if self._direction * off_um > self._threshold_um:
-            self._switch()
-        elif self._since_switch_s > _PATIENCE_S:
-            way = "rise" if self._direction > 0 else "sink"
-            around = self._around
-            open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
-            remedy = "check the pump, its tube and the leak" if self._direction > 0 else open_bleed
-            return Finished(False, f"{NO_ANSWER} {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}")
+        memory.overshoot_um = max(memory.overshoot_um, -memory.direction * off_um - self._threshold_um)
+        if math.isnan(memory.at_centre_s) and memory.direction * off_um > 0:
+            memory.at_centre_s = memory.time_s
         around = self._around
-        swing = self._direction * self._amplitudes_um_per_s[self._direction]
-        return around.within(around.holding_flow_um_per_s + swing)
+        if memory.direction * off_um > self._threshold_um:
+            self._switch()
+        elif memory.since_switch_s > _PATIENCE_S:
+            way = "rise" if memory.rises else "sink"
+            open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
+            remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
+            return Finished(False, f"{NO_ANSWER} {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}")
+        half = memory.up if memory.rises else memory.down
+        return around.within(around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s)
 
     def _switch(self) -> None:
         """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""
+        memory = self.memory
+        half, before = (memory.up, memory.down) if memory.rises else (memory.down, memory.up)
         wanted_um = OVERSHOOT_SHARE * self._around.limit_um
         # the guard stops anything that would coast further, however short the true delay
         fastest_um_per_s = wanted_um / self._motion.coast_s
-        if self._time_s > self._at_centre_s:
-            self._speeds_um_per_s[self._direction] = self._threshold_um / (self._time_s - self._at_centre_s)
-        if self.crossings > 0:
-            before = -self._direction
-            factor = min(
-                wanted_um / max(self._overshoot_um, _OVERSHOOT_LEAST_UM),
-                fastest_um_per_s / self._speeds_um_per_s[before],
-            )
-            self._amplitudes_um_per_s[before] *= min(max(factor, 1 / _GROWTH), _GROWTH)
-        self._direction = -self._direction
-        self._overshoot_um = 0.0
-        self._since_switch_s = 0.0
-        self._at_centre_s = math.nan
-        self.crossings += 1
+        if memory.time_s > memory.at_centre_s:
+            half.speed_um_per_s = self._threshold_um / (memory.time_s - memory.at_centre_s)
+        if memory.crossings > 0:
+            by_overshoot = wanted_um / max(memory.overshoot_um, _OVERSHOOT_LEAST_UM)
+            factor = min(by_overshoot, fastest_um_per_s / before.speed_um_per_s)
+            before.amplitude_um_per_s *= min(max(factor, 1 / _GROWTH), _GROWTH)
+        memory.rises = not memory.rises
+        memory.overshoot_um = 0.0
+        memory.since_switch_s = 0.0
+        memory.at_centre_s = math.nan
+        memory.crossings += 1

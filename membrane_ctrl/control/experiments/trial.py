@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from firmware_iface.settings import Fraction, Section
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.control.gas import PumpCurve
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # Specification of an experiment: plain data with bounds, as it comes over the control port.
 
@@ -48,33 +50,47 @@ class ExperimentSpec(Section):
     steps: Annotated[tuple[PumpStep, ...], Field(max_length=90)] = ()  # of the pump map
 
 
+@dataclass(slots=True)
+class PumpStepsState(StateNode):
+    """Where a pump map is."""
+
+    motion: machine.MotionState = field(default_factory=machine.MotionState)
+    in_step_s: float = 0.0
+    steps_done: Count = 0
+
+
 class PumpSteps:
     """The experiment behind the pump's curve: constant pump commands, 0..1; the mirror is the flow meter.
 
     The session (`tuning`) decides which commands, for how long and until which height, between two experiments.
     """
 
-    def __init__(self, centre_um: float, steps: Sequence[PumpStep], stretch: float = 1.0) -> None:
+    def __init__(
+        self, centre_um: float, steps: Sequence[PumpStep], stretch: float = 1.0, memory: PumpStepsState | None = None
+    ) -> None:
+        self.memory = memory or PumpStepsState()
         self._centre_um = centre_um
-        self._steps = list(steps)
-        self._motion = machine.CentreMotion(stretch)
-        self._in_step_s = 0.0
+        self._steps = steps
+        self._motion = machine.CentreMotion(stretch, memory=self.memory.motion)
 
     def step(self, measurement: machine.BenchSample, dt_s: float) -> float | machine.Finished:
         """One tick: the command until the next reading, or the end."""
         self._motion.update(measurement.displacement_um, dt_s)
-        self._in_step_s += dt_s
+        memory = self.memory
+        memory.in_step_s += dt_s
         if self._over():
-            self._steps.pop(0)
-            self._in_step_s = 0.0
-        return self._steps[0].fraction if self._steps else machine.Finished(True, "pump mapped")
+            memory.steps_done += 1
+            memory.in_step_s = 0.0
+        if memory.steps_done == len(self._steps):
+            return machine.Finished(True, "pump mapped")
+        return self._steps[memory.steps_done].fraction
 
     def _over(self) -> bool:
         """Whether the present step is."""
-        now, off_um = self._steps[0], self._motion.position_um - self._centre_um
+        now, off_um = self._steps[self.memory.steps_done], self._motion.position_um - self._centre_um
         if now.until_um is not None and (off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um):
             return True
-        return self._in_step_s > now.duration_s
+        return self.memory.in_step_s > now.duration_s
 
 
 # Flows in time for `Patterned`, sized so that the mirror stays within a few um. Each takes the identified gain: the
@@ -129,37 +145,78 @@ def multisine(
 _PATTERNS = {"steps": steps, "doublets": doublets, "multisine": multisine}
 
 
+@dataclass(slots=True)
+class TrialState(StateNode):
+    """An experiment in progress: what it was made of, and where it is."""
+
+    spec: ExperimentSpec
+    around: machine.Around
+    centre_um: float
+    left_s: float
+    guard: machine.GuardState = field(default_factory=machine.GuardState)
+    # one of these
+    relay: machine.RelayState | None = None
+    pattern: machine.PatternState | None = None
+    pump_steps: PumpStepsState | None = None
+
+
+def begin_trial(spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> TrialState:
+    """The state of an experiment that begins about `centre_um`."""
+    around = machine.Around(
+        holding_flow_um_per_s=spec.holding_flow_um_per_s,
+        least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
+        full_flow_um_per_s=loop.flow_most_um_per_s(pump),
+        laser_um=spec.laser_um,
+        limit_um=spec.limit_um,
+        late_s=spec.late_s,
+    )
+    around = machine.quieted(around, loop.rate_hz)
+    begun = TrialState(spec, around, centre_um, spec.duration_s)
+    match spec.kind:
+        case "relay":
+            begun.relay = machine.begin_relay(around)
+        case "pump_map":
+            begun.pump_steps = PumpStepsState()
+        case _:
+            begun.pattern = machine.PatternState()
+    return begun
+
+
 class Trial:
-    """An experiment inside its guard, about `centre_um`.
+    """An experiment inside its guard.
 
     Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit; the message says
     what would help.
+
+    Parameters
+    ----------
+    memory : TrialState
+        See `begin_trial`.
+    rate_hz : float
+        Tick rate.
     """
 
-    def __init__(self, spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> None:
-        self.spec = spec
-        around = machine.Around(
-            holding_flow_um_per_s=spec.holding_flow_um_per_s,
-            least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
-            full_flow_um_per_s=loop.flow_most_um_per_s(pump),
-            laser_um=spec.laser_um,
-            limit_um=spec.limit_um,
-            late_s=spec.late_s,
+    def __init__(self, memory: TrialState, rate_hz: float) -> None:
+        self.memory = memory
+        self._guard = machine.ExcursionGuard(
+            self._make_machine(), memory.around, memory.centre_um, rate_hz, self.raw, memory.guard
         )
-        around = machine.quieted(around, loop.rate_hz)
-        experiment = self._machine(around, centre_um)
-        self._guard = machine.ExcursionGuard(experiment, around, centre_um, loop.rate_hz, self.raw)
-        self._left_s = spec.duration_s
 
-    def _machine(self, around: machine.Around, centre_um: float) -> machine.Experiment:
-        spec = self.spec
+    def _make_machine(self) -> machine.Experiment:
+        memory, spec, around = self.memory, self.memory.spec, self.memory.around
         if spec.kind == "relay":
-            return machine.Relay(around, centre_um, spec.duration_s)
+            return machine.Relay(around, memory.centre_um, spec.duration_s, memory.relay)
         if spec.kind == "pump_map":
             if not spec.steps:
                 raise ValueError("a pump map without steps: use `tune pump`")
-            return PumpSteps(centre_um, spec.steps, around.stretch)
-        return machine.Patterned(around, _PATTERNS[spec.kind](around, spec.gain), spec.duration_s, centre_um)
+            return PumpSteps(memory.centre_um, spec.steps, around.stretch, memory.pump_steps)
+        wave = _PATTERNS[spec.kind](around, spec.gain)
+        return machine.Patterned(around, wave, spec.duration_s, memory.centre_um, memory.pattern)
+
+    @property
+    def spec(self) -> ExperimentSpec:
+        """What was asked for."""
+        return self.memory.spec
 
     @property
     def raw(self) -> bool:
@@ -168,8 +225,8 @@ class Trial:
 
     def step(self, measurement: machine.BenchSample, dt_s: float) -> float | machine.Finished:
         """One tick: what to put out until the next reading, or the end."""
-        self._left_s -= dt_s
-        if self.raw and self._left_s < 0:
+        self.memory.left_s -= dt_s
+        if self.raw and self.memory.left_s < 0:
             return machine.Finished(
                 False, f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump"
             )

@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.state_tree import Count, StateNode
 
 # A gust may lose the order of a few frames, which the next ones have again.
 LOST_S = 1.0
@@ -271,17 +272,20 @@ class Stethoscope:
         """What is new of a matter: that it begins, or that it is over."""
         if bool(says) == (name in self.heard.said):
             return []
-        self.heard.said ^= {name}
+        if says:
+            self.heard.said.append(name)
+        else:
+            self.heard.said.remove(name)
         return [events.Maintenance(name, says) if says else events.MaintenanceOver(name, over)]
 
 
 @dataclass
-class HeardMode:
+class HeardMode(StateNode):
     """A mode over the searches; times are UTC in seconds."""
 
     last: VibrationMode
     line: VibrationMode | None = None  # of the last search; None where it was not heard
-    missed: int = 0  # searches since it was heard
+    missed: Count = 0  # searches since it was heard
     recent_hz: list[float] = field(default_factory=list)
     past: list[tuple[float, float]] = field(default_factory=list)  # time and frequency, some a day, of a week
 
@@ -313,8 +317,8 @@ class HeardMode:
 
 
 @dataclass
-class Heard:
+class Heard(StateNode):
     """What a listener knows, for the next one."""
 
     modes: list[HeardMode] = field(default_factory=list)  # each keeps its place
-    said: set[str] = field(default_factory=set)  # notices that stand
+    said: list[str] = field(default_factory=list)  # notices that stand

@@ -16,12 +16,15 @@ curvature is the frequency's variance, and frequencies with a T nearly as large 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.state_tree import ArrayShape, StateNode
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 ComplexArray = NDArray[np.complex128]
 
@@ -50,13 +53,14 @@ MOVED = 0.009  # relative, told from here on: none of 1 %, which is 2 % of the f
 
 
 @dataclass(frozen=True)
-class VibrationMode:
+class VibrationMode(StateNode):
     """One vibration."""
 
     frequency_hz: float
     sigma_hz: float
     amplitude_nm: float  # of the oscillation, RMS over the mirror, whose ring rests
-    shape: FloatArray  # (terms,): terms, unit RMS; the largest is positive
+    # (terms,): terms, unit RMS; the largest is positive
+    shape: Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]
     evidence: float  # T less that of noise
     # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
     aliases_hz: tuple[float, ...] = ()

@@ -104,6 +104,10 @@ class TableReader:
                 return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in pairs}
         return {}
 
+    def column_names(self) -> list[str]:
+        """The columns of the table, as in its first readable file; empty without one."""
+        return next((schema.names for schema in map(self._schema_of, self.numbers) if schema is not None), [])
+
     def _schema_of(self, number: int) -> pa.Schema | None:
         try:
             if self._part(number).exists():

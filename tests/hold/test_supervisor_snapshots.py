@@ -1,4 +1,4 @@
-"""The supervisor records the controller's memory now and then, and a replay can begin with it."""
+"""The supervisor takes a snapshot of the controller now and then, and a replay can begin with it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.memory import recall
-from membrane_ctrl.controller.tick import MESSAGE_BYTES, TickAssembler
+from membrane_ctrl.controller.snapshot import continue_from
+from membrane_ctrl.controller.tick import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES, TickAssembler
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.clock import RunClock
@@ -51,22 +51,29 @@ class PromptBench:
         self._bench.close()
 
 
-async def test_the_memory_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("membrane_ctrl.hold.supervisor.MEMORY_EVERY_S", 0.1)
+async def test_the_snapshot_is_the_one_before_its_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("membrane_ctrl.hold.supervisor.SNAPSHOT_EVERY_S", 0.1)
     with ExitStack() as stack:
-        sizes = {"telemetry": ROW_BYTES, "events": 4096, "inputs": MESSAGE_BYTES}
-        addresses = {name: stack.enter_context(ring(2000, size)) for name, size in sizes.items()}
+        sizes = {
+            "telemetry": (2000, ROW_BYTES),
+            "events": (2000, 4096),
+            "inputs": (2000, MESSAGE_BYTES),
+            "snapshots": (8, SNAPSHOT_MESSAGE_BYTES),
+        }
+        addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
-        inputs = RingReader(addresses["inputs"])
-        for end in (*writers.values(), inputs):
+        inputs, snapshots = RingReader(addresses["inputs"]), RingReader(addresses["snapshots"])
+        for end in (*writers.values(), inputs, snapshots):
             stack.callback(end.close)
         controller = Controller(CONFIG, zernike_projection())
         supervisor = Supervisor(controller, Wiring(bench=PromptBench(), **writers), RunClock.start(), 50.0)
         assert await supervisor.run(0.4) == Exit.DONE
-        batch = TickAssembler().take(inputs.drain())
-    assert batch.memories
-    for tick, memory in batch.memories.items():
-        assert recall(memory, Controller(CONFIG, zernike_projection()))._ticks == tick - 1
+        assembler = TickAssembler()
+        assembler.add_snapshots(snapshots.drain())
+        batch = assembler.take(inputs.drain())
+    assert batch.snapshots
+    for tick, snapshot in batch.snapshots.items():
+        assert continue_from(snapshot, CONFIG, zernike_projection()).memory.ticks == tick - 1
 
 
 def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:

@@ -1,0 +1,69 @@
+"""What the controller remembers from tick to tick: one tree of dataclasses, and nothing beside it.
+
+`Controller` works on the tree in place. A snapshot is the tree as JSON (`encode_state`); a controller that is made
+with a decoded snapshot continues to the last bit (docs/replay.md).
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control.inner_loop import InnerLoopState
+from membrane_ctrl.control.shape_loop import ShapeLoopState
+from membrane_ctrl.controller.commands import Gains, GainsState
+from membrane_ctrl.controller.interlocks import InterlocksState
+from membrane_ctrl.controller.observer import ObserverState
+from membrane_ctrl.controller.pump_obeys import StandstillState
+from membrane_ctrl.controller.safe_levels import ResumeState, SafeLevelsState
+from membrane_ctrl.controller.safety import SafetyState
+from membrane_ctrl.controller.scene import SceneState
+from membrane_ctrl.controller.sensor_consistency import HoldersState, SensorConsistencyState
+from membrane_ctrl.model.state_tree import Count, StateNode
+from membrane_ctrl.model.telemetry import ShapeState, State
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedShape(StateNode):
+    """State and reason of the shape loop, as last reported."""
+
+    state: ShapeState
+    reason: str  # without its numbers
+
+
+@dataclass(slots=True)
+class ControllerState(StateNode):
+    """All that a tick needs of the ticks before it."""
+
+    gains: GainsState
+    scene: SceneState
+    consistency: SensorConsistencyState
+    ticks: Count = 0
+    state: State = State.STANDBY
+    state_since_s: float = math.nan
+    fault: Count | None = None  # code of the standing fault's rule
+    tick_error: str = ""
+    said_why: str = ""  # the operator's line as last reported, without its numbers
+    why_words: str = ""  # as it is
+    why_since_s: float = 0.0
+    reported_shape: ReportedShape | None = None
+    setpoint_back_um: float = math.nan  # after a trial that steps the setpoint
+    shape_back: bool = False  # likewise: the shape loop is on again
+    safety: SafetyState = field(default_factory=SafetyState)
+    levels: SafeLevelsState = field(default_factory=SafeLevelsState)
+    resume: ResumeState = field(default_factory=ResumeState)
+    observer: ObserverState = field(default_factory=ObserverState)
+    standstill: StandstillState = field(default_factory=StandstillState)
+    interlocks: InterlocksState = field(default_factory=InterlocksState)
+    loop: InnerLoopState = field(default_factory=InnerLoopState)
+    shape: ShapeLoopState = field(default_factory=ShapeLoopState)
+    holders: HoldersState = field(default_factory=HoldersState)
+
+
+def first_state(config: Config) -> ControllerState:
+    """The state before a run's first tick."""
+    gains = Gains(config.loop, config.shape.time_constant_s, config.pump)
+    return ControllerState(
+        gains=GainsState(good=gains, tried=gains),
+        scene=SceneState(config.loop.setpoint_um),
+        consistency=SensorConsistencyState(config.loop.setpoint_um, config.loop.bleed_fraction),
+    )
