@@ -37,6 +37,7 @@ class Routes:
 
 
 ROUTES = Routes()
+_BEGIN_S = 60.0  # of an attack on a busy machine
 
 
 async def connect(url: str) -> Streams:
@@ -85,77 +86,69 @@ async def status_of(url: str, raw: bytes, wait_s: float = 20.0) -> int:
         writer.close()
 
 
-async def _flood_logins(url: str, number: int) -> None:
+async def _flood_logins(url: str, streams: Streams, number: int) -> None:
     """Post wrong passwords for a name that no other client uses."""
-    await _repeat_login(url, f"x{number}", "yyyyyyyy")
+    await _repeat_login(url, streams, f"x{number}", "yyyyyyyy")
 
 
-async def _flood_owner(url: str, number: int) -> None:
+async def _flood_owner(url: str, streams: Streams, number: int) -> None:
     """Post wrong passwords for the owner's name."""
-    await _repeat_login(url, "anna", f"guess{number:04}")
+    await _repeat_login(url, streams, "anna", f"guess{number:04}")
 
 
-async def _repeat_login(url: str, name: str, password: str) -> None:
+async def _repeat_login(url: str, streams: Streams, name: str, password: str) -> None:
     """Post a login without a pause, on one connection as long as it lives."""
+    reader, writer = streams
     form = f"name={name}&password={password}".encode()
     raw = request_bytes(url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded")
-    reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        while True:
-            writer.write(raw)
-            await writer.drain()
-            await _read_answer(reader)
+    while True:
+        writer.write(raw)
+        await writer.drain()
+        await _read_answer(reader)
 
 
-async def _open_sockets(url: str, number: int) -> None:
+async def _open_sockets(url: str, streams: Streams, number: int) -> None:
     """Ask for a web socket without a session, again and again."""
+    reader, writer = streams
     key = base64.b64encode(os.urandom(16)).decode()
     upgrade = ("Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13")
-    reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        writer.write(request_bytes(url, ROUTES.socket, "GET", b"", *upgrade))
-        await reader.read()
+    writer.write(request_bytes(url, ROUTES.socket, "GET", b"", *upgrade))
+    await reader.read()
 
 
-async def _stay_silent(url: str, number: int) -> None:
-    """Open a connection and send nothing."""
-    reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        await reader.read()
+async def _stay_silent(url: str, streams: Streams, number: int) -> None:
+    """Send nothing."""
+    await streams[0].read()
 
 
-async def _drip_head(url: str, number: int) -> None:
+async def _drip_head(url: str, streams: Streams, number: int) -> None:
     """Send a head that never ends, a byte a second."""
-    _reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        writer.write(request_bytes(url, "")[:-2] + b"X-Padding: ")
-        await _send_forever(writer, b"x", pause_s=1.0)
+    writer = streams[1]
+    writer.write(request_bytes(url, "")[:-2] + b"X-Padding: ")
+    await _send_forever(writer, b"x", pause_s=1.0)
 
 
-async def _drip_body(url: str, number: int) -> None:
+async def _drip_body(url: str, streams: Streams, number: int) -> None:
     """Announce a form and send it a byte a second."""
-    _reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        writer.write(request_bytes(url, ROUTES.login, "POST", b"n" * 3000)[:-3000])
-        await _send_forever(writer, b"n", pause_s=1.0)
+    writer = streams[1]
+    writer.write(request_bytes(url, ROUTES.login, "POST", b"n" * 3000)[:-3000])
+    await _send_forever(writer, b"n", pause_s=1.0)
 
 
-async def _send_large_heads(url: str, number: int) -> None:
+async def _send_large_heads(url: str, streams: Streams, number: int) -> None:
     """Send headers without end, as fast as they are received."""
-    _reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        writer.write(request_bytes(url, "")[:-2])
-        await _send_forever(writer, b"X-Padding: " + b"x" * 8000 + b"\r\n")
+    writer = streams[1]
+    writer.write(request_bytes(url, "")[:-2])
+    await _send_forever(writer, b"X-Padding: " + b"x" * 8000 + b"\r\n")
 
 
-async def _send_large_bodies(url: str, number: int) -> None:
+async def _send_large_bodies(url: str, streams: Streams, number: int) -> None:
     """Post a body of a gigabyte, as fast as it is received."""
+    writer = streams[1]
     path = ROUTES.login if number % 2 else ""
     head = request_bytes(url, path, "POST").replace(b"Content-Length: 0", b"Content-Length: 1000000000")
-    _reader, writer = await connect(url)
-    with contextlib.closing(writer):
-        writer.write(head)
-        await _send_forever(writer, b"x" * 65_536)
+    writer.write(head)
+    await _send_forever(writer, b"x" * 65_536)
 
 
 async def _send_forever(writer: asyncio.StreamWriter, data: bytes, pause_s: float = 0.0) -> None:
@@ -166,7 +159,7 @@ async def _send_forever(writer: asyncio.StreamWriter, data: bytes, pause_s: floa
         await asyncio.sleep(pause_s)
 
 
-ATTACKS: dict[str, Callable[[str, int], Awaitable[None]]] = {
+ATTACKS: dict[str, Callable[[str, Streams, int], Awaitable[None]]] = {
     "logins": _flood_logins,
     "owner": _flood_owner,
     "sockets": _open_sockets,
@@ -179,12 +172,27 @@ ATTACKS: dict[str, Callable[[str, int], Awaitable[None]]] = {
 
 
 async def attack_until_ended(name: str, url: str, clients: int) -> None:
-    """Run an attack with a number of clients; a client that is disconnected begins again."""
+    """Run an attack with a number of clients; a client that is disconnected begins again.
+
+    Prints a line once every client has begun.
+    """
+    waiting = set(range(clients))
+
+    def begin(number: int) -> None:
+        if waiting:
+            waiting.discard(number)
+            if not waiting:
+                print("all clients have begun", flush=True)
 
     async def repeat(number: int) -> None:
         while True:
             with contextlib.suppress(OSError, EOFError, asyncio.IncompleteReadError):
-                await ATTACKS[name](url, number)
+                try:
+                    streams = await connect(url)
+                finally:
+                    begin(number)
+                with contextlib.closing(streams[1]):
+                    await ATTACKS[name](url, streams, number)
             await asyncio.sleep(0.01)
 
     await asyncio.gather(*(repeat(number) for number in range(clients)))
@@ -194,15 +202,17 @@ async def attack_until_ended(name: str, url: str, clients: int) -> None:
 async def attack(name: str, url: str, clients: int) -> AsyncIterator[None]:
     """An attack in a process of its own, until left."""
     words = ["-m", "tests.support.service_attacks", name, url, str(clients)]
-    process = await asyncio.create_subprocess_exec(sys.executable, *words)
+    process = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
     try:
-        await asyncio.sleep(3.0)  # until all clients are connected
-        assert process.returncode is None, "the attack has ended"
+        assert process.stdout is not None
+        async with asyncio.timeout(_BEGIN_S):
+            assert await process.stdout.readline(), "the attack has ended"
         yield
+        assert process.returncode is None, "the attack has ended"
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGKILL)
-        await process.wait()
+        await process.communicate()
 
 
 class Viewer:
