@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.program import file_origin
 
 # Where the mirror is high, the light turns back earlier: the reflected wavefront leads by twice the height. POPPY has
@@ -38,10 +38,7 @@ def fits_bytes(x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray, remove
 
     Raises InputError if astropy is missing.
     """
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise errors.InputError("--format fits needs astropy: pip install 'membrane-ctrl[fits]'") from None
+    fits = import_optional("astropy.io.fits", "fits")
     x_mm, y_mm, height_mm = _squared(x_mm, y_mm, height_mm)
     measured = np.isfinite(height_mm)
     lead_m = np.where(measured, _LEAD_PER_HEIGHT * _M_PER_MM * np.nan_to_num(height_mm), 0.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,11 +15,15 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.run_files import levels, run_folder, run_head, shapes, streams, table_specs
+from membrane_ctrl.run_files import labelled, levels, run_folder, run_head, shapes, streams, table_specs
 from membrane_ctrl.run_files.recorded_rate import at_recorded_rate
 from membrane_ctrl.run_files.shapes import Shapes
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import TableSpec
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 Block = dict[str, Column]
 # From the last tick to the end of a run.
@@ -115,6 +119,70 @@ class Run:
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
         return streams.named_table(found.select(wanted).columns(), self.origin_utc)
+
+    def to_pandas(
+        self,
+        table: labelled.LabelledTable = "ticks",
+        names: Sequence[str] | None = None,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        window_s: float = 10.0,
+    ) -> "pd.DataFrame":
+        """A table as a frame with its UTC as index; codes are categories of names, a missing number is NaN.
+
+        Parameters
+        ----------
+        table : {"ticks", "overview", "cycles"}
+            Which of the methods of these names gives the rows.
+        names : sequence of str, optional
+            Columns of `ticks` or `overview`; all by default.
+        start_s, end_s : float
+            Part of the run to read.
+        window_s : float
+            Of `overview`.
+
+        Raises InputError if pandas is missing.
+        """
+        return labelled.make_frame(self._named(table, names, start_s, end_s, window_s))
+
+    def to_xarray(
+        self,
+        table: labelled.LabelledTable = "ticks",
+        names: Sequence[str] | None = None,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        window_s: float = 10.0,
+    ) -> "xr.Dataset":
+        """A table as a dataset along `time` (UTC), each variable with `units` and `long_name`; as `to_pandas`.
+
+        Of `cycles`, `coeffs_um` is an array along `time` and `noll`, and there are the recorded covariances.
+
+        Raises InputError if xarray is missing.
+        """
+        about = {"run": self.name, "started_utc": self.origin_utc.isoformat(), "recorded_by": self.recorded_by}
+        if table == "cycles":
+            return labelled.make_cycles_dataset(self.shapes(), (start_s, end_s), self.origin_utc, about)
+        spec = table_specs.TICKS if table == "ticks" else table_specs.LEVELS[window_s]
+        named = self._named(table, names, start_s, end_s, window_s)
+        return labelled.make_dataset(named, labelled.labels_of(spec), about)
+
+    def _named(
+        self,
+        table: labelled.LabelledTable,
+        names: Sequence[str] | None,
+        start_s: float,
+        end_s: float,
+        window_s: float,
+    ) -> pa.Table:
+        """A table for people. Raises ValueError for an unknown name."""
+        match table:
+            case "ticks":
+                return self.ticks(names, start_s, end_s)
+            case "overview":
+                return self.overview(window_s, start_s, end_s, names or ())
+            case "cycles":
+                return self.cycles(start_s, end_s)
+        raise ValueError(f"no such table: {table}; known: ticks, overview, cycles")
 
     def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
         """Telemetry as arrays, codes as numbers, in blocks: a month needs no more memory than a night."""

@@ -131,6 +131,6 @@ def test_without_astropy_the_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_result(tmp_path, np.where(INSIDE, 0 * X_MM, np.nan))
-    monkeypatch.setitem(sys.modules, "astropy.io", None)
+    monkeypatch.setitem(sys.modules, "astropy.io.fits", None)
     assert run(["export-figure", str(tmp_path), "--format", "fits"]) == 2
     assert "pip install 'membrane-ctrl[fits]'" in capsys.readouterr().err
