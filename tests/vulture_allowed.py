@@ -26,6 +26,7 @@ _.focal_length_mm, _.tilt_x_urad, _.tilt_y_urad, _.irregularity_pv_um, _.irregul
 _.pvr_um, _.rotational_pv_um, _.asymmetry_rms_um, _.slope_rms_urad  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
 _.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
+_.to_xarray, open_result, open_stability  # for scripts: docs/data.md
 _.screen_x_mm, _.screen_y_mm, _.screen_turn_x_deg, _.screen_turn_y_deg, _.screen_turn_z_deg  # sigmas, read by name
 _.camera_yaw_deg, _.camera_pitch_deg, _.camera_roll_deg, _.focal_relative, _.k1, _.k2, _.p1, _.p2, _.pitch_relative
 _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose request has these
