@@ -15,9 +15,9 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import Awaitable, Callable, Iterable
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from collections.abc import Awaitable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 from firmware_iface import roles
 
@@ -30,26 +30,27 @@ _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the l
 
 @dataclass(frozen=True, slots=True)
 class RoleDevices:
-    """Which device fills which role; None where the bench has none."""
+    """Which device fills which role; None where the bench has none. `others` are further ones of `roles.SENSORS`."""
 
     displacement: roles.DisplacementSensor | None
     pump: roles.Pump
     gauge_pressure: roles.PressureSensor
     vent: roles.Vent | None = None
-    barometer: roles.Barometer | None = None
-    thermometer: roles.Thermometer | None = None
+    others: Mapping[str, roles.Device] = field(default_factory=dict)
 
     def by_role(self) -> dict[str, roles.Device]:
         """The filled roles, actuators last: nothing may move gas before the sensors are connected."""
         filled: dict[str, roles.Device | None] = {
             "displacement": self.displacement,
-            "gauge_pressure": self.gauge_pressure,
-            "barometer": self.barometer,
-            "thermometer": self.thermometer,
+            **self.sensors(),
             "vent": self.vent,
             "pump": self.pump,
         }
         return {role: device for role, device in filled.items() if device is not None}
+
+    def sensors(self) -> dict[str, roles.Device]:
+        """The sensors that give one value a tick, by role."""
+        return {"gauge_pressure": self.gauge_pressure, **self.others}
 
 
 class RoleBench:
@@ -111,18 +112,16 @@ class RoleBench:
         try:
             pump, vent = await self._actuators()
         finally:
-            sample, gauge_pa, ambient_pa, air_c = await sensors
-        if sample.quality == NO_ANSWER and math.isfinite(gauge_pa):
+            sample, values = await sensors
+        if sample.quality == NO_ANSWER and math.isfinite(values["gauge_pressure_pa"]):
             # the laser is lost, or there is none, and the bench is not: counted downwards, as no laser does
             sample = replace(sample, sample_counter=min(sample.sample_counter, 0) - 1, device_time_s=self._clock())
             self._last_sample = sample
-        return roles.BenchReading(
+        return replace(
+            roles.NO_READING,
+            **values,
             displacement_um=sample.displacement_um,
             displacement_quality=sample.quality,
-            gauge_pressure_pa=gauge_pa,
-            ambient_pressure_pa=ambient_pa,
-            air_temperature_c=air_c,
-            gas_temperature_c=math.nan,
             pump_fraction=pump,
             vent_fraction=vent,
             sample_counter=sample.sample_counter,
@@ -168,14 +167,11 @@ class RoleBench:
             with contextlib.suppress(Exception):  # one driver's mistake must not leave the next device open
                 await device.close()
 
-    async def _sensors(self) -> tuple[roles.DisplacementSample, float, float, float]:
-        devices = self._devices
-        return await asyncio.gather(
-            self._sample(),
-            self._value("gauge_pressure", devices.gauge_pressure.gauge_pressure_pa),
-            self._value("barometer", devices.barometer.ambient_pressure_pa if devices.barometer else None),
-            self._value("thermometer", devices.thermometer.air_temperature_c if devices.thermometer else None),
-        )
+    async def _sensors(self) -> tuple[roles.DisplacementSample, dict[str, Any]]:
+        """The displacement, and the values of the other sensors by their field of `BenchReading`."""
+        asked = asyncio.gather(*(self._value(role) for role in roles.SENSORS.values()))
+        sample, values = await asyncio.gather(self._sample(), asked)
+        return sample, dict(zip(roles.SENSORS, values, strict=True))
 
     async def _actuators(self) -> tuple[float, float]:
         """Read-back of pump and vent; NaN for a vent that the bench does not have."""
@@ -199,14 +195,17 @@ class RoleBench:
                 self._failed("displacement", error)
         return self._last_sample
 
-    async def _value(self, role: str, read: Callable[[], Awaitable[float]] | None) -> float:
-        if read is None or role in self._tasks:
+    async def _value(self, role: roles.Role) -> float:
+        """The newest value of a sensor; NaN without one, and while it is reopened."""
+        device = self._devices.sensors().get(role.name)
+        if device is None or role.name in self._tasks:
             return math.nan
         try:
-            return await answer(role, read())
+            value: float = await answer(role.name, getattr(device, role.reads)())
         except roles.LinkError as error:
-            self._failed(role, error)
+            self._failed(role.name, error)
             return math.nan
+        return value
 
     def _failed(self, role: str, error: roles.LinkError) -> None:
         if isinstance(error, roles.LinkDownError) and role not in self._tasks:

@@ -6,7 +6,7 @@ A driver converts to these units; nothing beyond it knows registers, counts or b
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -45,6 +45,36 @@ class DeviceBusyError(LinkError):
         self.lapses_in_s = lapses_in_s
 
 
+@dataclass(frozen=True, slots=True)
+class Role:
+    """What a device is for: a table `[devices.<name>]` of the configuration.
+
+    Attributes
+    ----------
+    name : str
+    reads : str
+        The driver's method that is asked in every tick. Of a sensor also the quantity that it measures: a simulated
+        mirror has an attribute of this name.
+    unit : str
+        Of the answer.
+    needed : bool
+        Whether gas may move only with such a device.
+    """
+
+    name: str
+    reads: str
+    unit: str
+    needed: bool = False
+
+
+_ROLE = "role"
+
+
+def _sensor(name: str, reads: str, unit: str, needed: bool = False) -> dict[str, Role]:
+    """Return the metadata of a field of `BenchReading` that the sensor of a role fills. Parameters: see `Role`."""
+    return {_ROLE: Role(name, reads, unit, needed)}
+
+
 # bits of `BenchReading.foreign`
 FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 
@@ -52,6 +82,11 @@ FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 @dataclass(frozen=True, slots=True)
 class BenchReading:
     """One consistent sample of all sensors.
+
+    A field with a role is filled by the sensor of that role. To add a sensor role, add a field with its role here, a
+    row of the same name to the table of telemetry columns, and a rule that uses it: configuration, bench, record,
+    check, wizard and emulated lab follow. An instrument of a new quantity also needs a contract below and its drivers
+    in `settings.SENSOR_DRIVERS`.
 
     `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen values. Quantities
     the bench lacks are NaN. `displacement_quality` is 0 when good (else the laser's error code). `foreign` tells
@@ -61,9 +96,9 @@ class BenchReading:
 
     displacement_um: float
     displacement_quality: int
-    gauge_pressure_pa: float
-    ambient_pressure_pa: float
-    air_temperature_c: float
+    gauge_pressure_pa: float = field(metadata=_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True))
+    ambient_pressure_pa: float = field(metadata=_sensor("barometer", "ambient_pressure_pa", "Pa"))
+    air_temperature_c: float = field(metadata=_sensor("thermometer", "air_temperature_c", "degC"))
     gas_temperature_c: float
     pump_fraction: float
     vent_fraction: float
@@ -74,6 +109,38 @@ class BenchReading:
     foreign: int = 0
     interlock_inputs: int = 0  # bit i: the board's interlock input i is closed; 0 without inputs: all open
     interlocks_open: int = 0
+
+
+# For a tick without an answer; its integers, which have no NaN, are unused.
+NO_READING = BenchReading(
+    displacement_um=math.nan,
+    displacement_quality=0,
+    gauge_pressure_pa=math.nan,
+    ambient_pressure_pa=math.nan,
+    air_temperature_c=math.nan,
+    gas_temperature_c=math.nan,
+    pump_fraction=math.nan,
+    vent_fraction=math.nan,
+    sample_counter=0,
+    device_time_s=math.nan,
+    watchdog_tripped=False,
+    latched_faults=0,
+)
+
+# Roles of sensors that give one value a tick, by the field of `BenchReading`.
+SENSORS: dict[str, Role] = {each.name: each.metadata[_ROLE] for each in fields(BenchReading) if each.metadata}
+# All roles in the order in which a person is asked for their devices: first those that every bench needs.
+ROLES: dict[str, Role] = {
+    role.name: role
+    for role in (
+        Role("displacement", "displacement", "um", needed=True),
+        Role("pump", "pump_fraction", "of full scale", needed=True),
+        *(role for role in SENSORS.values() if role.needed),
+        Role("vent", "vent_fraction", "of full scale"),
+        *(role for role in SENSORS.values() if not role.needed),
+    )
+}
+ACTUATORS = ("pump", "vent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,17 +296,6 @@ class InterlockSource(Device, Protocol):
 
     async def closed_circuits(self) -> tuple[bool, ...]:
         """Whether each circuit is closed, in the order in which the source was given them. Raises LinkError."""
-
-
-# What the device of a role is asked for in every tick, and in which unit it answers
-READS = {
-    "displacement": ("displacement", "um"),
-    "gauge_pressure": ("gauge_pressure_pa", "Pa"),
-    "barometer": ("ambient_pressure_pa", "Pa"),
-    "thermometer": ("air_temperature_c", "degC"),
-    "pump": ("pump_fraction", "of full scale"),
-    "vent": ("vent_fraction", "of full scale"),
-}
 
 
 @dataclass(frozen=True, slots=True)

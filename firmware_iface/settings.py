@@ -248,6 +248,12 @@ PressureDriver = Annotated[
 ]
 BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig | ExternalConfig, Driver]
 ValueDriver = Annotated[ModbusMapConfig | ExternalConfig, Driver]
+# By what a sensor measures (`roles.Role.reads`): its drivers.
+SENSOR_DRIVERS: dict[str, Any] = {
+    "gauge_pressure_pa": PressureDriver,
+    "ambient_pressure_pa": BarometerDriver,
+    "air_temperature_c": ValueDriver,
+}
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
 

@@ -250,7 +250,7 @@ async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
     """Open, read and close each device in turn; a failure does not stop the others."""
     probes = []
     for role, device in devices.by_role().items():
-        read, unit = roles.READS[role]
+        read, unit = roles.ROLES[role].reads, roles.ROLES[role].unit
         probes.append(await _probe(role, device, getattr(device, read), unit))
         if probes[-1].problem:
             await asyncio.sleep(_BACK_OFF_S)

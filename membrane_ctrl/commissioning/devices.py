@@ -14,7 +14,7 @@ from firmware_iface import drivers, roles, settings
 from firmware_iface.links import aravis
 from firmware_iface.links.serial_port import serial_ports
 from membrane_ctrl.config import reference, toml_file
-from membrane_ctrl.config.schema import NEEDED, ROLES, Config, DevicesConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, terminal
 
@@ -144,8 +144,8 @@ def _answers(found: list[FoundDevice]) -> TomlTable:
         typer.echo(line, err=True)
     board = _asked("pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)")
     section: TomlTable = {"board": board} if board else {}
-    for role in () if board else ROLES:
-        section |= _role(role, optional=role not in NEEDED)
+    for role in () if board else roles.ROLES.values():
+        section |= _role(role.name, optional=not role.needed)
     section |= (camera := _role("camera", optional=True))
     if camera and not _shows_patterns(camera["camera"]):
         section |= _role("screen", optional=False)

@@ -11,23 +11,28 @@ import typer
 
 from firmware_iface import drivers, roles
 from membrane_ctrl.config import toml_file
-from membrane_ctrl.config.schema import ROLES, DevicesConfig
+from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.model import errors
 
 _TEMPLATES = Path(__file__).parent / "scaffold"
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _LONGEST = 30  # the lines of the files stay within 118 characters
-# What a role's instrument is, how the invented one answers, and two values in the role's unit
+# By what the driver is asked for (`roles.Role.reads`): what the instrument is, how the invented one answers, and two
+# values in the role's unit
 _WORDS: dict[str, dict[str, Any]] = {
     "displacement": {"what": "displacement sensor", "Role": "DisplacementSensor", "unit": "mm", "divisor": 1000.0},
-    "gauge_pressure": {"what": "pressure gauge", "Role": "PressureSensor", "unit": "mbar", "divisor": 100.0},
-    "barometer": {"what": "barometer", "Role": "Barometer", "unit": "hPa", "divisor": 100.0},
-    "thermometer": {"what": "thermometer", "Role": "Thermometer", "unit": "degC", "divisor": 1.0},
-    "pump": {"what": "pump", "Role": "Pump", "unit": "percent", "divisor": 100.0},
-    "vent": {"what": "valve", "Role": "Vent", "unit": "percent", "divisor": 100.0},
+    "gauge_pressure_pa": {"what": "pressure gauge", "Role": "PressureSensor", "unit": "mbar", "divisor": 100.0},
+    "ambient_pressure_pa": {"what": "barometer", "Role": "Barometer", "unit": "hPa", "divisor": 100.0},
+    "air_temperature_c": {"what": "thermometer", "Role": "Thermometer", "unit": "degC", "divisor": 1.0},
+    "pump_fraction": {"what": "pump", "Role": "Pump", "unit": "percent", "divisor": 100.0},
+    "vent_fraction": {"what": "valve", "Role": "Vent", "unit": "percent", "divisor": 100.0},
 }
 _SCALES = {"mm": "UM_PER_MM", "mbar": "PA_PER_MBAR", "hPa": "PA_PER_HPA", "degC": "DEGC", "percent": "PERCENT"}
-_EXAMPLES = {"displacement": (12.0, 20.0), "gauge_pressure": (600.0, 520.0), "barometer": (101_325.0, 99_800.0)}
+_EXAMPLES = {
+    "displacement": (12.0, 20.0),
+    "gauge_pressure_pa": (600.0, 520.0),
+    "ambient_pressure_pa": (101_325.0, 99_800.0),
+}
 _OTHERS = {
     "displacement": 'driver = "optoncdt1420"\nport = "/dev/ttyUSB0"\nrange_mm = 50\nrate_khz = 2\n',
     "pump": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id = 3\n',
@@ -39,7 +44,7 @@ _OPTICS = {
     "camera": {"camera": 'driver = "external"\nname = "{name}"\n', "screen": 'driver = "pygame"\n'},
     "screen": {"camera": 'driver = "aravis"\n', "screen": 'driver = "external"\nname = "{name}"\n'},
 }
-ROLES_OF_DRIVERS = (*ROLES, *_OPTICS)
+ROLES_OF_DRIVERS = (*roles.ROLES, *_OPTICS)
 
 
 def write_package(name: str, role: str, folder: Path) -> int:
@@ -52,7 +57,7 @@ def write_package(name: str, role: str, folder: Path) -> int:
         raise errors.InputError(f"--role {role}: no such role; {toml_file.hint(role, list(ROLES_OF_DRIVERS))}")
     words = _names(name, role) | (_optics(name, role) if role in _OPTICS else _instrument(role))
     target = folder / f"{words['dashed']}-driver"  # with a dash, Python never takes the folder for the module
-    kind = "actuator" if role in ("pump", "vent") else "displacement" if role == "displacement" else "value"
+    kind = "actuator" if role in roles.ACTUATORS else "displacement" if role == "displacement" else "value"
     prefix, lab = (f"{role}_", "optics_lab.toml.txt") if role in _OPTICS else ("", "lab.toml.txt")
     files = {
         "pyproject.toml": "pyproject.toml.txt",
@@ -121,16 +126,17 @@ def _tables(devices: dict[str, str]) -> str:
 
 def _instrument(role: str) -> dict[str, Any]:
     """Return what the templates of an instrument say of its role."""
-    words = _WORDS[role]
-    first, second = _EXAMPLES.get(role, (21.5, 23.0))
+    reads = roles.ROLES[role].reads
+    words = _WORDS[reads]
+    first, second = _EXAMPLES.get(reads, (21.5, 23.0))
     unit, divisor = words["unit"], words["divisor"]
     others = {other: table for other, table in _OTHERS.items() if other != role}
     return {
         **words,
-        "read": roles.READS[role][0],
-        "role_unit": roles.READS[role][1],
+        "read": reads,
+        "role_unit": roles.ROLES[role].unit,
         "suffix": {"degC": "c"}.get(unit, unit.lower()),
-        "quantity": {"thermometer": "an error"}.get(role, "pressure"),
+        "quantity": "an error" if reads == "air_temperature_c" else "pressure",
         "field": unit,
         "SCALE": _SCALES[unit],
         "scale": 1 / divisor if unit == "percent" else divisor,

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
 from firmware_iface import drivers
-from firmware_iface.roles import READS
+from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import hint, sections
 from membrane_ctrl.model.errors import InputError
@@ -170,7 +170,7 @@ def _places_of_driver(driver: Any, kind: drivers.DriverKind) -> list[str]:
         return ["devices.camera"]
     if kind is drivers.SCREENS:
         return ["devices.screen"]
-    return [f"devices.{role}" for role, (read, _) in READS.items() if hasattr(driver, read)]
+    return [f"devices.{name}" for name, role in ROLES.items() if hasattr(driver, role.reads)]
 
 
 def unit_of(name: str) -> str:

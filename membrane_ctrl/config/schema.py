@@ -9,11 +9,12 @@ when to change it. Everything that explains the configuration is made from these
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, create_model, model_validator
 
 from firmware_iface import settings
+from firmware_iface.roles import ACTUATORS, ROLES, SENSORS
 from firmware_iface.settings import Section
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.control import (
@@ -41,13 +42,21 @@ __all__ = [
     "ResumeConfig", "ShapeConfig", "StatesConfig", "TwinConfig",
 ]  # fmt: skip
 
-ROLES = ("displacement", "pump", "gauge_pressure", "vent", "barometer", "thermometer")
 INTERLOCKS_MAX = 32  # bits of a mask that telemetry carries as a double
 # required before any gas moves: the loop's two ends, and the limit that protects the film
-NEEDED = ("displacement", "pump", "gauge_pressure")
+NEEDED = tuple(name for name, role in ROLES.items() if role.needed)
+
+if TYPE_CHECKING:  # `DevicesConfig.roles` gives their tables
+    SensorTables = Section
+else:
+    SensorTables = create_model(
+        "SensorTables",
+        __base__=Section,
+        **{role.name: (settings.SENSOR_DRIVERS[role.reads] | None, None) for role in SENSORS.values()},
+    )
 
 
-class DevicesConfig(Section):
+class DevicesConfig(SensorTables):
     """Which device fills which role: a board fills all, or one table per role."""
 
     board: settings.ModbusUrl | None = None
@@ -58,10 +67,7 @@ class DevicesConfig(Section):
     """Time without commands after which the board stops the pump. Raise it for tick rates below 4 Hz."""
     displacement: settings.DisplacementDriver | None = None
     pump: settings.PumpDriver | None = None
-    gauge_pressure: settings.PressureDriver | None = None
     vent: settings.ValueDriver | None = None
-    barometer: settings.BarometerDriver | None = None
-    thermometer: settings.ValueDriver | None = None
     camera: settings.CameraConfig | None = None
     screen: settings.ScreenConfig | None = None
     interlocks: Annotated[tuple[settings.InterlockDriver, ...], Field(max_length=INTERLOCKS_MAX)] = ()
@@ -77,7 +83,7 @@ class DevicesConfig(Section):
         missing = [role for role in NEEDED if role not in filled]
         if self.board is None and missing not in ([], ["displacement"]):  # a laser is `Config`'s affair
             raise ValueError(f"no device for {missing[0]}; required: {', '.join(NEEDED)}")
-        for role in ("pump", "vent"):
+        for role in ACTUATORS:
             section = getattr(self, role)
             if isinstance(section, settings.ModbusMapConfig) and not _is_fraction(section.limits or section.value):
                 raise ValueError(f"{role}: value and limits of an actuator are fractions within 0..1")

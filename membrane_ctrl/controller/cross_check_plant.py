@@ -287,7 +287,7 @@ def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> N
     """Judge limits against sensor ranges: a limit outside its sensor's range never trips."""
     limits, devices = config.limits, config.devices
     laser = devices.displacement if devices is not None else None
-    gauge = devices.gauge_pressure if devices is not None else None
+    gauge = devices.roles().get("gauge_pressure") if devices is not None else None
     stated_um = stated_pa = (-math.inf, math.inf)
     if isinstance(laser, ModbusMapConfig):
         stated_um = laser.limits or laser.value

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from firmware_iface.roles import BenchCommand, BenchReading
+from firmware_iface.roles import NO_READING, BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
 from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
@@ -179,7 +179,7 @@ class Observer:
             foreign=reading.foreign if reading else 0,
             lateness_ms=inputs.lateness_ms,
             dead_tasks=inputs.dead_tasks,
-            reading=reading,
+            reading=reading or NO_READING,
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:

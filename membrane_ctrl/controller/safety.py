@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
-from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, BenchReading
+from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, NO_READING, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -61,12 +61,12 @@ class Observation:
     open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
     interlock_level: SafeLevel = SafeLevel.NONE  # the deepest level of the open ones
     interlock_words: str = ""  # the open ones with their texts
-    reading: BenchReading | None = None  # the device's answer of this tick, for properties that need no memory
+    reading: BenchReading = NO_READING  # all sensors as they answered in this tick, for properties without memory
 
     @property
     def vent_fraction(self) -> float:
         """The vent's read-back; NaN without one."""
-        return self.reading.vent_fraction if self.reading else math.nan
+        return self.reading.vent_fraction
 
     @property
     def depth_um(self) -> float:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from firmware_iface.roles import BenchReading
+from firmware_iface.roles import NO_READING
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import filters, inner_loop, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
@@ -16,22 +16,6 @@ from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
-
-# for the record of a tick without an answer; its integers, which have no NaN, are unused
-_NO_READING = BenchReading(
-    displacement_um=math.nan,
-    displacement_quality=0,
-    gauge_pressure_pa=math.nan,
-    ambient_pressure_pa=math.nan,
-    air_temperature_c=math.nan,
-    gas_temperature_c=math.nan,
-    pump_fraction=math.nan,
-    vent_fraction=math.nan,
-    sample_counter=0,
-    device_time_s=math.nan,
-    watchdog_tripped=False,
-    latched_faults=0,
-)
 
 
 @dataclass(slots=True)
@@ -188,7 +172,7 @@ def telemetry_row(
     shape: shape_loop.ShapeOutput,
 ) -> telemetry.TelemetryRow:
     """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
-    reading = inputs.reading or _NO_READING
+    reading = inputs.reading or NO_READING
     out = scene.output or inner_loop.NO_OUTPUT
     seen = scene.estimate.telemetry() if scene.estimate else {}
     return telemetry.TelemetryRow(
@@ -217,8 +201,6 @@ def telemetry_row(
         pump_readback_fraction=reading.pump_fraction,
         vent_readback_fraction=reading.vent_fraction,
         gauge_pressure_pa=observation.gauge_pressure_pa,
-        ambient_pressure_pa=reading.ambient_pressure_pa,
-        air_temperature_c=reading.air_temperature_c,
         gas_temperature_c=reading.gas_temperature_c,
         # of the laser's readings: rows without one must not pass for such
         displacement_quality=math.nan
@@ -232,6 +214,7 @@ def telemetry_row(
         truth_laser_bias_um=inputs.truth_laser_bias_um,
         interlocks_open=_interlocks_open(scene.interlocks),
         **seen,
+        **{name: getattr(reading, name) for name in tick.AS_READ},
     )
 
 

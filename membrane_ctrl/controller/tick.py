@@ -9,17 +9,18 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from firmware_iface.roles import BenchCommand, BenchReading
+from firmware_iface.roles import SENSORS, BenchCommand, BenchReading
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, shape_estimate, telemetry
+from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.events import Event
 
 
@@ -62,28 +63,27 @@ class TickOutputs:
 # First bytes of the inputs ring's messages.
 TICK, PIECE = b"T", b"P"
 
-_FORMATS = {
-    "displacement_quality": "i8", "sample_counter": "i8", "latched_faults": "i8", "watchdog_tripped": "u1",
-    "foreign": "u1", "interlock_inputs": "i8", "interlocks_open": "i8",
-}  # fmt: skip
-_READING = tuple(field.name for field in fields(BenchReading))
+_FORMATS = {float: "f8", int: "i8", bool: "u1"}
+_READING = {name: _FORMATS[kind] for name, kind in get_type_hints(BenchReading).items()}
 _LINK_UP, _HAS_READING = 1, 2
 RECORD = np.dtype(
     [
         ("tick", "<i8"), ("now_s", "<f8"), ("dt_s", "<f8"), ("lateness_ms", "<f8"), ("missed_ticks", "<i8"),
         ("flags", "u1"),
-        *((name, "<" + _FORMATS.get(name, "f8")) for name in _READING),
+        *((name, f"<{code}") for name, code in _READING.items()),
         ("estimate_time_s", "<f8"), ("truth_displacement_um", "<f8"), ("truth_laser_bias_um", "<f8"),
         ("output_crc", "<u4"), ("tail_bytes", "<u4"),
     ]
 )  # fmt: skip
 Records = NDArray[np.void]
+# Readings of sensors that the telemetry row repeats as they are; that of the gauge it has without jumps.
+AS_READ = tuple(name for name in SENSORS if name in COLUMNS and name != "gauge_pressure_pa")
 # Fields of a record that the tick's telemetry row repeats.
 SAME = {
     "now_s": "mono_s", "pump_fraction": "pump_readback_fraction", "vent_fraction": "vent_readback_fraction",
     **{name: name for name in (
-        "tick", "lateness_ms", "missed_ticks", "ambient_pressure_pa", "air_temperature_c", "gas_temperature_c",
-        "device_time_s", "truth_displacement_um", "truth_laser_bias_um",
+        "tick", "lateness_ms", "missed_ticks", *AS_READ, "gas_temperature_c", "device_time_s",
+        "truth_displacement_um", "truth_laser_bias_um",
     )},
 }  # fmt: skip
 _TAIL_LOST = 2**32 - 1  # no tail is that long
@@ -98,7 +98,7 @@ MESSAGE_BYTES = _ROW_PLACE + telemetry.ROW_BYTES
 # Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
-_NO_READING = tuple(0 if name in _FORMATS else math.nan for name in _READING)
+_NO_READING = tuple(math.nan if code == "f8" else 0 for code in _READING.values())
 
 
 def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -> list[bytes]:

@@ -24,22 +24,21 @@ from membrane_ctrl.model.terminal import one_line
 # Makes the driver of a role from its `[devices.<role>]` table.
 
 
-ACTUATORS = ("pump", "vent")
-
-
 def role_devices(devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None) -> role_bench.RoleDevices:
     """The drivers named in the tables, not yet connected; those on one serial bus share it.
 
     Raises InputError for a port, URL, preset or setting that the driver does not accept.
     """
     links = links or modbus_rtu.ModbusLinks()
-    made: dict[str, Any] = {"displacement": None}  # a bench held by its optics may have none
+    made: dict[str, Any] = {}
     for role, section in devices.roles().items():
         try:
             made[role] = _driver(role, section, links)
         except ValueError as error:
             raise InputError(f"devices.{role}: {error}") from None
-    return role_bench.RoleDevices(**made)
+    displacement = made.pop("displacement", None)  # a bench held by its optics may have none
+    vent = made.pop("vent", None)
+    return role_bench.RoleDevices(displacement, made.pop("pump"), made.pop("gauge_pressure"), vent, made)
 
 
 def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLinks) -> Any:
@@ -56,9 +55,9 @@ def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLink
             )
         case _:
             device = driver_loading.make_driver(section, f"devices.{role}", drivers.SENSORS)
-            if not hasattr(device, roles.READS[role][0]):
+            if not hasattr(device, roles.ROLES[role].reads):
                 name = driver_loading.name_of(section)
-                raise ValueError(f"the driver {name} has no {roles.READS[role][0]}, so it is no {role}")
+                raise ValueError(f"the driver {name} has no {roles.ROLES[role].reads}, so it is no {role}")
             return device
 
 
@@ -73,7 +72,7 @@ def _modbus_value(
 ) -> modbus_map.ModbusValue:
     value_map, fence = modbus_map.make_map(map_keys(section), section.preset)
     link = links.link(section.link, section.unit_id, section.timeout_s, fence)
-    return modbus_map.ModbusValue(link, value_map, rest=0.0 if role in ACTUATORS else None)
+    return modbus_map.ModbusValue(link, value_map, rest=0.0 if role in roles.ACTUATORS else None)
 
 
 def map_keys(section: settings.ModbusMapConfig) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from firmware_iface.emulators import (
     serial_device,
 )
 from firmware_iface.links import modbus_rtu, serial_port
+from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import bench, driver_loading
 
@@ -160,18 +161,14 @@ class Lab:
         match section:
             case settings.Optoncdt1420Config():
                 return lasers.Optoncdt1420Emulator(
-                    self._sensor("displacement"), round(section.range_mm or 50), section.direction, section.baud
+                    self._sensor(role), round(section.range_mm or 50), section.direction, section.baud
                 )
             case settings.KeyenceDlRs1aConfig():
                 return lasers.KeyenceDlRs1aEmulator(
-                    self._sensor("displacement"),
-                    section.direction,
-                    section.baud,
-                    section.parity,
-                    section.amplifier + 1,
+                    self._sensor(role), section.direction, section.baud, section.parity, section.amplifier + 1
                 )
             case settings.VaisalaPtb330Config():
-                return pressure_gauges.VaisalaPtb330Emulator(self._sensor("barometer"), section.baud)
+                return pressure_gauges.VaisalaPtb330Emulator(self._sensor(role), section.baud)
             case settings.Mks937bConfig():
                 return pressure_gauges.Mks937bEmulator(
                     self._sensor(role), section.baud, section.parity, section.address, section.channel
@@ -222,20 +219,14 @@ class Lab:
             return pumps.Instrument(
                 "DMFC", serial or "M20000001A", _FLOW_FULL_MLN_MIN, "mln/min", None, self._actuator(role)
             )
-        gauge_pa = self._sensor("gauge_pressure")
+        gauge_pa = self._sensor(role)
         return pumps.Instrument(
             "DEPC", serial or "M20000002A", _PRESSURE_FULL_MBAR, "mbar(g)", lambda: gauge_pa() / 100
         )
 
     def _sensor(self, role: str) -> Callable[[], float]:
         """Present value of a role's sensor, in the role's unit."""
-        names: Mapping[str, str] = {
-            "displacement": "displacement_um",
-            "gauge_pressure": "gauge_pressure_pa",
-            "barometer": "ambient_pressure_pa",
-            "thermometer": "air_temperature_c",
-        }
-        name = names[role]
+        name = "displacement_um" if role == "displacement" else ROLES[role].reads
         return lambda: float(getattr(self._plant.sample(), name))
 
     def _actuator(self, role: str) -> Callable[[float], None]:

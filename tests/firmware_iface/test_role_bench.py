@@ -86,8 +86,7 @@ class Devices:
             self.pump,
             self.gauge,
             self.vent if vent else None,
-            self.barometer,
-            self.air,
+            {"barometer": self.barometer, "thermometer": self.air},
         )
         self.bench = RoleBench(roles, WATCHDOG_S, lambda: asyncio.get_running_loop().time())
 
