@@ -60,7 +60,7 @@ def test_the_watch_sees_a_blind_safety_table(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_the_watch_sees_safe_levels_that_stay_on_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     def stay(self: SafeLevels, safe_level: SafeLevel, now_s: float) -> None:
-        self.safe_level = SafeLevel.HOLD_FLOW
+        self.memory.safe_level = SafeLevel.HOLD_FLOW
 
     monkeypatch.setattr(SafeLevels, "enter", stay)
     for name in ("network cut", "gauge lost", "pump runs at full"):
