@@ -41,5 +41,4 @@ _.membrane_ctrl, _.you, _.role, _.status, _.event, _.notice, _.calibrated_utc, _
 find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults.md, the safety case and the campaign
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
-_.reason_code  # compared with the rest of its dataclass
 Barometer, Thermometer  # contracts of drivers, which packages of others fill

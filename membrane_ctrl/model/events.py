@@ -36,10 +36,9 @@ class StateEntered(
 
 
 class Why(Event, kind="why", sentence="{why}"):
-    """The operator's line changed; `code` names the reason (`reason.WhyCode`)."""
+    """The operator's line changed."""
 
     why: str
-    code: str = ""
 
 
 class Fault(
@@ -92,11 +91,10 @@ class Resumed(Event, kind="resumed", sentence="Fault {name} is cleared by the re
 
 
 class ShapeLoopState(Event, kind="shape", sentence="Shape loop {state}[: {reason}]"):
-    """The shape loop's state, or the reason for it, changed; `code` names the reason."""
+    """The shape loop's state, or the reason for it, changed."""
 
     state: str
     reason: str
-    code: str = ""
 
 
 class CommandTaken(
@@ -180,12 +178,11 @@ class GainsReverted(
 
 
 class ExperimentEnded(Event, kind="experiment", sentence="Experiment {experiment} ended[: {reason}]", notable=True):
-    """An experiment is over; `end` is how (`machine.ExperimentEnd`)."""
+    """An experiment is over."""
 
     experiment: str
     completed: bool
     reason: str
-    end: str
 
 
 class Plausibility(
