@@ -150,7 +150,7 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{field}: missing; it has no default"
     if kind in ("dict_type", "model_type"):
-        return f"{field}: write a table, [{field}] and its keys below"
+        return f"{field}: write a table, [{field}] and its keys below" if field else "input should be an object"
     if kind == "tuple_type":
         return f"{field}: write a list, " + (f"[[{field}]] and its keys below" if inner else "in square brackets")
     if kind == "string_pattern_mismatch" and error["ctx"]["pattern"] == MODBUS_URL_PATTERN:

@@ -139,7 +139,7 @@ class ShapeOutput:
 
 
 @dataclass(slots=True)
-class ShapeLoopState(StateNode):
+class ShapeLoopMemory(StateNode):
     """What the loop remembers from tick to tick."""
 
     state: telemetry.ShapeState = telemetry.ShapeState.OFF
@@ -157,11 +157,11 @@ class ShapeLoopState(StateNode):
 class ShapeLoop:
     """Trim from shape estimates; off until switched on. `sensitivity` as for `sag_change`."""
 
-    def __init__(self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopState | None = None) -> None:
+    def __init__(self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopMemory | None = None) -> None:
         self._config = config
         self._sensitivity = sensitivity
         self._time_constant_s = config.time_constant_s
-        self.memory = memory or ShapeLoopState()
+        self.memory = memory or ShapeLoopMemory()
 
     @property
     def on(self) -> bool:

@@ -188,7 +188,7 @@ def _settings(command: Command) -> dict[str, object] | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Gains(StateNode):
+class GainsInForce(StateNode):
     """All settings that a `gains` command changes."""
 
     loop: LoopConfig
@@ -200,8 +200,8 @@ class Gains(StateNode):
 class GainsState(StateNode):
     """The settings in force, and those that a trial goes back to."""
 
-    good: Gains
-    tried: Gains
+    good: GainsInForce
+    tried: GainsInForce
     until_s: float = math.nan  # end of the trial; NaN: there is none
     setpoint_step_um: float = math.nan  # part of the trial; NaN: the setpoint and the shape loop are not
 
@@ -236,7 +236,7 @@ class GainsTrial:
             self.keep()
 
     @property
-    def in_force(self) -> Gains:
+    def in_force(self) -> GainsInForce:
         """The present settings."""
         return self.memory.tried
 

@@ -32,7 +32,7 @@ _REST_RISE_MAX_UM = 6.0
 
 
 @dataclass(frozen=True, slots=True)
-class Block(StateNode):
+class PressureBlock(StateNode):
     """Means over a block, NaN without a value."""
 
     end_s: float
@@ -76,7 +76,7 @@ class OpenBlock(StateNode):
 class StandstillState(StateNode):
     """What was observed of the pump since it was commanded off."""
 
-    blocks: deque[Block] = field(default_factory=deque)
+    blocks: deque[PressureBlock] = field(default_factory=deque)
     open_block: OpenBlock = field(default_factory=OpenBlock)
     on_since_s: float = math.nan  # the read-back of a pump that should have stopped
     read_s: float = math.nan  # the last reading
@@ -179,7 +179,7 @@ class Standstill:
             block.ambient_pressure_pa.mean,
             block.air_temperature_c.mean,
         )
-        memory.blocks.append(Block(now_s, *means))
+        memory.blocks.append(PressureBlock(now_s, *means))
         if len(memory.blocks) > _WEATHER_BLOCKS:
             memory.blocks.popleft()
         memory.open_block = OpenBlock(now_s + _BLOCK_S)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.inner_loop import InnerLoopState
-from membrane_ctrl.control.shape_loop import ShapeLoopState
-from membrane_ctrl.controller.commands import Gains, GainsState
+from membrane_ctrl.control.shape_loop import ShapeLoopMemory
+from membrane_ctrl.controller.commands import GainsInForce, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
 from membrane_ctrl.controller.pump_obeys import StandstillState
@@ -55,13 +55,13 @@ class ControllerState(StateNode):
     standstill: StandstillState = field(default_factory=StandstillState)
     interlocks: InterlocksState = field(default_factory=InterlocksState)
     loop: InnerLoopState = field(default_factory=InnerLoopState)
-    shape: ShapeLoopState = field(default_factory=ShapeLoopState)
+    shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
     holders: HoldersState = field(default_factory=HoldersState)
 
 
 def first_state(config: Config) -> ControllerState:
     """The state before a run's first tick."""
-    gains = Gains(config.loop, config.shape.time_constant_s, config.pump)
+    gains = GainsInForce(config.loop, config.shape.time_constant_s, config.pump)
     return ControllerState(
         gains=GainsState(good=gains, tried=gains),
         scene=SceneState(config.loop.setpoint_um),

@@ -118,12 +118,12 @@ class InputsReader:
                 records[name] = _numbers(same, column)[there]
             yield records
 
-    def _texts(self, spec: TableSpec) -> Iterator[_Text]:
+    def _texts(self, spec: TableSpec) -> Iterator[_TextRow]:
         names = spec.schema.names
         for table in self._reader(spec).tables(names, self._from_s):
             if table.column_names == names:
                 rows = zip(*(table.column(name).to_pylist() for name in names), strict=True)
-                yield from (_Text(*values) for values in rows if None not in values)
+                yield from (_TextRow(*values) for values in rows if None not in values)
 
     def _snapshot_times_s(self) -> Iterator[float]:
         for table in self._reader(table_specs.SNAPSHOTS).tables(["time_s"]):
@@ -171,7 +171,7 @@ class _TickRows:
 
 
 @dataclass(frozen=True, slots=True)
-class _Text:
+class _TextRow:
     """A row of the table of rare inputs or of snapshots."""
 
     time_s: float

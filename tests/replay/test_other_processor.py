@@ -88,7 +88,7 @@ def test_other_numbers_are_a_difference(
     code, report = replayed(record, capsys)
     assert (code, report["verdict"]) == (Exit.REJECTED, "different")
     assert report["state_differences"] is not None
-    assert bool(report["different"]) == (share > 1e-4)
+    assert report["different"] or share < 1e-4
 
 
 def test_on_the_same_processor_other_last_bits_are_a_difference(

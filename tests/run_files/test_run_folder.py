@@ -33,7 +33,7 @@ def test_configuration_is_written_whole_and_reads_back(tmp_path: Path) -> None:
     assert config_file.load(run_dir / "config.toml", Config) == config
     assert "barometer_gain_um_per_pa" in text  # a default nobody asked for
     assert "None" not in text
-    assert [path.name for path in run_dir.iterdir()] == ["config.toml"]
+    assert {path.name for path in run_dir.iterdir()} == {"config.toml", "run.json"}
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a b", ".hidden", "x" * 65, "a/b"])
