@@ -33,12 +33,6 @@ EXCEPTIONS: dict[str, str] = {
     "membrane_ctrl/config/toml_file.py:_cause": "the parser of TOML gives no more than a message",
     "membrane_ctrl/config/toml_file.py:describe": "joins a message to its key; only a point or a colon depends on it",
     "membrane_ctrl/model/errors.py:named": "puts a file's name before a message; nothing but the message changes",
-    "membrane_ctrl/console/why.py:why": "the controller's reasons have no codes",
-    "membrane_ctrl/console/why.py:is_paused": "the controller's reasons have no codes",
-    "membrane_ctrl/web/page.py:_key": "the controller's reasons have no codes",
-    "membrane_ctrl/controller/controller.py:_step_shape": "the shape loop's reasons have no codes",
-    "membrane_ctrl/controller/controller.py:_tell_why": "the controller's reasons have no codes",
-    "tuning/identification/characterise.py:_relays": "the ends of experiments have no codes",
     "firmware_iface/driver_calls.py:_name_device": "puts a device's name before a message without it",
 }
 

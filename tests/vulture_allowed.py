@@ -42,3 +42,4 @@ find_keepers, find_bound, _.distance_um  # the protection table, for docs/faults
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
+_.reason_code  # compared with the rest of its dataclass

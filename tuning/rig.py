@@ -223,7 +223,7 @@ class HoldRig:
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
-        return rows, machine.Finished(told.completed, told.reason)
+        return rows, machine.Finished(machine.ExperimentEnd(told.end), told.reason)
 
     def set_gains(
         self,

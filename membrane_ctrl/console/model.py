@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import duration, go_on, is_paused, number, why
+from membrane_ctrl.console.why import duration, go_on, number, why
 from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import events, run_events, run_status, shape_estimate, telemetry
 from membrane_ctrl.model.lock import describe_lock
@@ -160,8 +160,8 @@ class ConsoleModel:
             row=row,
             why=self._why(),
             locks=tuple(map(describe_lock, status.locks)),
-            go_on=go_on(row, status.why, self._ctl, self._keys, status.locks, status.latched) if row else "",
-            paused=row is not None and is_paused(row, status.why),
+            go_on=go_on(row, status.paused, self._ctl, self._keys, status.locks, status.latched) if row else "",
+            paused=status.paused,
             silent_s=age_s if age_s > SILENT_S else 0.0,
             state=telemetry.State(int(row.state)) if row else telemetry.State.STANDBY,
             state_age_s=max(0.0, now_s - self._status.since_s),
@@ -193,7 +193,7 @@ class ConsoleModel:
         status = self._status
         if status.row is None:
             return status.why or "starting: no tick yet"
-        return why(status.row, status.why, fault_words(status.fault), self._config)
+        return why(status.row, status.why, fault_words(status.fault), self._config, status.paused)
 
     def _shape(self, now_s: float) -> ShapeView:
         estimate, since, row, status = self._estimate, self._reference, self._status.row, self._status

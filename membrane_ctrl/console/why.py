@@ -41,7 +41,7 @@ def holders(row: TelemetryRow) -> str:
     return ", ".join(words) or "nothing"
 
 
-def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
+def why(row: TelemetryRow, told: str, fault: str, config: Config, paused: bool = False) -> str:
     """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
     state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
     if safe_level != SafeLevel.NONE:
@@ -51,7 +51,7 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config) -> str:
     sees = math.isfinite(row.displacement_um) or math.isfinite(row.estimate_sigma_um)
     if not (sees and math.isfinite(row.filtered_um)):
         return f"{_LEVELS[SafeLevel.HOLD_FLOW]}: {told or fault or 'no valid laser reading'}"
-    if told.startswith("paused"):
+    if paused:
         return told
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
@@ -72,20 +72,17 @@ def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> st
     return _LEVELS[safe_level]
 
 
-def go_on(row: TelemetryRow, told: str, ctl: str, keys: bool, locks: Sequence[Lock] = (), latched: str = "") -> str:
+def go_on(
+    row: TelemetryRow, paused: bool, ctl: str, keys: bool, locks: Sequence[Lock] = (), latched: str = ""
+) -> str:
     """How to go on from a state that waits for a person, empty in others; `ctl` begins a command for this run."""
     state = State(int(row.state))
     if locks:
         return f"go on: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
     if state == State.STANDBY and latched:
         state = State.FAULT
-    command, key = ("resume", " or key p") if is_paused(row, told) else _GO_ON.get(state, ("", ""))
+    command, key = ("resume", " or key p") if paused else _GO_ON.get(state, ("", ""))
     return f"go on: `{ctl} {command}`{key if keys else ''}" if command else ""
-
-
-def is_paused(row: TelemetryRow, told: str) -> bool:
-    """Whether the loop is paused."""
-    return row.state == State.HOLD and told.startswith("paused")
 
 
 def _outside(row: TelemetryRow) -> str:

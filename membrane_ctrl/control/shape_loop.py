@@ -12,6 +12,7 @@ is only a tracker to tune.
 
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -20,6 +21,7 @@ from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.state_tree import ArrayShape, StateNode
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -125,12 +127,36 @@ def sag_change(
     return SagChange(change_um, information**-0.5)
 
 
+class ShapeCode(StrEnum):
+    """Why the shape loop does not track, or what limits it."""
+
+    SWITCHED_OFF = "switched_off"
+    WAITING = "waiting"
+    REFERENCE = "reference"
+    NOT_SETTLED = "not_settled"
+    NO_SHAPE = "no_shape"
+    REJECTED = "rejected"
+    MOVED_MEANWHILE = "moved_meanwhile"
+    NOT_NEWER = "not_newer"
+    NOT_FINITE = "not_finite"
+    NO_LASER = "no_laser"
+    LASER_MOVED = "laser_moved"
+    DISAGREE = "disagree"
+    CAMERA_REPEATS = "camera_repeats"
+    CAMERA_WRONG = "camera_wrong"
+    NO_MOUNT = "no_mount"
+    TRIM_LIMIT = "trim_limit"
+
+
+_SWITCHED_OFF = Reason(ShapeCode.SWITCHED_OFF, "switched off")
+
+
 @dataclass(frozen=True, slots=True)
 class ShapeOutput:
     """Output of the shape loop, with its reason."""
 
     state: telemetry.ShapeState
-    reason: str  # why it does not track, or what limits it; may be empty
+    reason: Reason  # why it does not track, or what limits it; may be empty
     trim_um: float  # to be added to the setpoint
     # change of sag since lock as last admitted, and its standard deviation; NaN until there is one
     sag_change_um: float
@@ -143,7 +169,7 @@ class ShapeLoopMemory(StateNode):
     """What the loop remembers from tick to tick."""
 
     state: telemetry.ShapeState = telemetry.ShapeState.OFF
-    reason: str = "switched off"
+    reason: Reason = _SWITCHED_OFF
     trim_um: float = 0.0
     base_um: float = 0.0  # the trim at lock
     reference: ReferenceMean = field(default_factory=ReferenceMean)
@@ -178,13 +204,13 @@ class ShapeLoop:
             self.lock(now_s)
         elif not on:
             self.memory.state = telemetry.ShapeState.OFF
-            self.memory.reason = "switched off"
+            self.memory.reason = _SWITCHED_OFF
 
     def lock(self, now_s: float) -> None:
         """Take the figure from now on as the reference; hold the trim meanwhile."""
         memory = self.memory
         memory.state = telemetry.ShapeState.WAITING
-        memory.reason = "waiting for the first shape"
+        memory.reason = Reason(ShapeCode.WAITING, "waiting for the first shape")
         memory.reference = ReferenceMean()
         memory.change = SagChange(math.nan, math.nan)
         memory.admitted_s = math.nan
@@ -197,7 +223,7 @@ class ShapeLoop:
         estimate: shape_estimate.ShapeEstimate | None,
         displacement_um: float,
         settled: bool,
-        distrust: str = "",
+        distrust: Reason = NO_REASON,
     ) -> ShapeOutput:
         """One tick.
 
@@ -211,8 +237,10 @@ class ShapeLoop:
         if self.memory.state != telemetry.ShapeState.OFF:
             if estimate is not None:
                 self.memory.seen_s = estimate.time_s
-            refusal = distrust or self._refusal(now_s, estimate, displacement_um, settled)
-            if refusal:
+            refusal = distrust
+            if refusal == NO_REASON:
+                refusal = self._refusal(now_s, estimate, displacement_um, settled)
+            if refusal != NO_REASON:
                 self._refuse(refusal)
             elif estimate is not None:
                 self._admit(estimate)
@@ -233,32 +261,34 @@ class ShapeLoop:
 
     def _refusal(
         self, now_s: float, estimate: shape_estimate.ShapeEstimate | None, displacement_um: float, settled: bool
-    ) -> str:
-        """Why this tick's estimate must not be used; empty if it may be."""
+    ) -> Reason:
+        """Why this tick's estimate must not be used; `NO_REASON` if it may be."""
         config = self._config
         if not settled:
-            return "the inner loop is not settled"
+            return Reason(ShapeCode.NOT_SETTLED, "the inner loop is not settled")
         if now_s - self.memory.seen_s > config.fresh_s:
-            return f"no shape younger than {config.fresh_s:g} s"
+            return Reason(ShapeCode.NO_SHAPE, f"no shape younger than {config.fresh_s:g} s")
         if estimate is None:
-            return ""
+            return NO_REASON
         if estimate.verdict == "rejected":
-            return f"shape rejected: {estimate.reason}"
+            return Reason(ShapeCode.REJECTED, f"shape rejected: {estimate.reason}")
         if estimate.time_s < self.memory.settled_since_s:
-            return "the shape was taken while the inner loop was not settled"
+            meanwhile = "the shape was taken while the inner loop was not settled"
+            return Reason(ShapeCode.MOVED_MEANWHILE, meanwhile)
         if estimate.time_s <= self.memory.admitted_s:
-            return "the shape is not newer than the last one"
+            return Reason(ShapeCode.NOT_NEWER, "the shape is not newer than the last one")
         if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
-            return "the shape is not finite"
+            return Reason(ShapeCode.NOT_FINITE, "the shape is not finite")
         moved_um = abs(displacement_um - estimate.displacement_um)
         if math.isnan(moved_um):
-            return "no laser reading to compare the shape with"
+            return Reason(ShapeCode.NO_LASER, "no laser reading to compare the shape with")
         if moved_um > config.disagreement_max_um:
-            return f"the laser has moved by {moved_um:.1f} um since the exposures"
-        return ""
+            moved = f"the laser has moved by {moved_um:.1f} um since the exposures"
+            return Reason(ShapeCode.LASER_MOVED, moved)
+        return NO_REASON
 
-    def _refuse(self, reason: str) -> None:
-        """Hold the trim and say why."""
+    def _refuse(self, reason: Reason) -> None:
+        """Hold the trim for a reason."""
         if self.memory.state != telemetry.ShapeState.WAITING:
             self.memory.state = telemetry.ShapeState.SUSPENDED
         self.memory.reason = reason
@@ -269,10 +299,11 @@ class ShapeLoop:
         if memory.state == telemetry.ShapeState.WAITING:
             memory.admitted_s = estimate.time_s
             reference.take(estimate)
-            memory.reason = f"reference: shape {reference.count} of {reference.wanted}"
+            taken = f"reference: shape {reference.count} of {reference.wanted}"
+            memory.reason = Reason(ShapeCode.REFERENCE, taken)
             if reference.complete:
                 memory.state = telemetry.ShapeState.TRACKING
-                memory.reason = ""
+                memory.reason = NO_REASON
                 memory.base_um = memory.trim_um
                 memory.drift.begin(reference.time_s)
                 reference.taken.clear()  # their mean is all that is needed
@@ -281,13 +312,14 @@ class ShapeLoop:
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
         apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
-            self._refuse(f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock anew")
+            apart = f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock again"
+            self._refuse(Reason(ShapeCode.DISAGREE, apart))
             return
         memory.admitted_s = estimate.time_s
         memory.change = change
         memory.drift.take(drift_um, estimate.time_s, self._time_constant_s)
         memory.state = telemetry.ShapeState.TRACKING
-        memory.reason = ""
+        memory.reason = NO_REASON
 
     def _move_trim(self, now_s: float, dt_s: float) -> None:
         """Move the trim to the drift, bounded in rate and range."""
@@ -298,4 +330,5 @@ class ShapeLoop:
         step_um = config.trim_rate_max_um_per_s * dt_s
         memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)
         at_limit = bounded_um != goal_um
-        memory.reason = f"trim at its limit of {config.trim_max_um:g} um" if at_limit else ""
+        limited = f"trim at its limit of {config.trim_max_um:g} um"
+        memory.reason = Reason(ShapeCode.TRIM_LIMIT, limited) if at_limit else NO_REASON

@@ -158,6 +158,7 @@ class StatusPart(_Part):
 
     state: _Name
     why: _Text
+    paused: Annotated[bool, Field(strict=True)] = False
     run: RunName | None = None
     fault: FaultPart | None = None
     row: dict[_Name, _Number | None] | None = None

@@ -23,6 +23,7 @@ def status_table(status: RunStatus) -> dict[str, Any]:
         "state": telemetry.State(int(row.state)).name.lower(),
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
+        "paused": status.paused,
         "locks": [{**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks],
         "latched": status.latched,
         "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,

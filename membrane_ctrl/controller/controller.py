@@ -31,14 +31,16 @@ from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
 from membrane_ctrl.model.lock import describe_locks
+from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
-_WITHOUT_LASER = "there is no laser whose mount could drift: the optics themselves are held"
+_WITHOUT_LASER = Reason(
+    shape_loop.ShapeCode.NO_MOUNT, "there is no laser whose mount could drift: the optics themselves are held"
+)
 _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
-_NO_DIGITS = str.maketrans("", "", "0123456789")
 
 
 class Controller:
@@ -366,7 +368,9 @@ class Controller:
         settled = self.state == State.HOLD and scene.levels.safe_level == SafeLevel.NONE
         if self._consistency.laser_moved and self._shape.on:
             self._shape.lock(inputs.now_s)
-        distrust = self._consistency.camera_lies or _WITHOUT_LASER * self._config.by_optics
+        distrust = self._consistency.camera_distrust
+        if distrust == NO_REASON and self._config.by_optics:
+            distrust = _WITHOUT_LASER
         try:
             shape = self._shape.step(
                 inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled, distrust
@@ -375,11 +379,10 @@ class Controller:
             self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
             shape = self._shape.output(inputs.now_s)
         scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
-        words = shape.reason.translate(_NO_DIGITS)  # changed numbers are not news
-        reported = ReportedShape(shape.state, words)
+        reported = ReportedShape(shape.state, shape.reason.code)
         if reported != self.memory.reported_shape:
             self.memory.reported_shape = reported
-            events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason))
+            events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code))
         return shape
 
     def _act(self, events: list[told.Event]) -> None:
@@ -401,7 +404,7 @@ class Controller:
                 self.memory.tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
                 scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
         if wanted != self.state:
-            self._go(wanted, scene.why, events)
+            self._go(wanted, scene.why.text, events)
 
     def _go(self, state: State, why: str, events: list[told.Event]) -> None:
         scene = self._scene
@@ -433,16 +436,16 @@ class Controller:
         """Report how the experiment ended: by itself, or because the state changed."""
         experiment = self._scene.trial
         assert experiment is not None
-        ended = self._scene.trial_ended or machine.Finished(False, why)
-        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason))
+        ended = self._scene.trial_ended or machine.Finished(machine.ExperimentEnd.INTERRUPTED, why)
+        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, ended.end))
 
     def _tell_why(self, events: list[told.Event]) -> None:
-        """Report the operator's line once its words (not its numbers) have changed durably."""
+        """Report the operator's line once its reason (not its numbers) has changed durably."""
         scene, memory = self._scene, self.memory
-        words = scene.why.translate(_NO_DIGITS)
-        if words != memory.why_words:
-            memory.why_words = words
+        code = scene.why.code
+        if code != memory.why_code:
+            memory.why_code = code
             memory.why_since_s = scene.now_s
-        if words != memory.said_why and scene.now_s - memory.why_since_s >= _WHY_STANDS_S:
-            memory.said_why = words
-            events.append(told.Why(scene.why))
+        if code != memory.reported_why_code and scene.now_s - memory.why_since_s >= _WHY_STANDS_S:
+            memory.reported_why_code = code
+            events.append(told.Why(scene.why.text, code))

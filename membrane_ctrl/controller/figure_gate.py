@@ -10,6 +10,7 @@ from enum import Enum
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.controller.jumps import JumpGate
+from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
 
@@ -187,11 +188,15 @@ class FigureGate:
             return FilmUnseen.NO_FIGURE_YET
         return FilmUnseen.NOT_ALIGNED if math.isnan(self.memory.zero_um.value) else FilmUnseen.NO_FIGURE
 
-    def describe_unseen(self) -> str:
-        """One phrase on why `loop_um` is NaN; empty if it is not."""
-        unseen = self.unseen
+    def explain_unseen(self) -> Reason:
+        """Why `loop_um` is NaN; `NO_REASON` if it is not."""
+        unseen, defect = self.unseen, self.memory.defect
         if unseen is None:
-            return ""
+            return NO_REASON
+        defect_name = "" if defect is None else defect.name.lower()
+        return make_reason(WhyCode.NO_READING, self._describe_unseen(unseen), unseen.name.lower(), defect_name)
+
+    def _describe_unseen(self, unseen: FilmUnseen) -> str:
         age = f" for {self.newest_age_s:.1f} s" if unseen is FilmUnseen.NO_FIGURE else ""
         if self.memory.defect is None or unseen in (FilmUnseen.REPEATS, FilmUnseen.NOT_ALIGNED):
             return f"{unseen.value}{age}"

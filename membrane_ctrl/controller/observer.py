@@ -8,6 +8,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
 from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
 from membrane_ctrl.controller.jumps import JumpGate
+from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode
 from membrane_ctrl.model.state_tree import StateNode
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
@@ -139,13 +140,14 @@ class Observer:
         return math.nan if self.laser_stuck else self.laser_um
 
     @property
-    def unseen(self) -> str:
-        """Why there is no displacement in this tick; empty if there is one."""
+    def unseen(self) -> Reason:
+        """Why there is no displacement in this tick; `NO_REASON` if there is one."""
         if math.isfinite(self.displacement_um):
-            return ""
+            return NO_REASON
         if self._by_optics:
-            return self.figures.describe_unseen()
-        return f"no valid laser reading (quality {self.reading.displacement_quality if self.reading else 'unknown'})"
+            return self.figures.explain_unseen()
+        quality = self.reading.displacement_quality if self.reading else "unknown"
+        return Reason(WhyCode.NO_READING, f"no valid laser reading (quality {quality})")
 
     @property
     def waited_s(self) -> float:
@@ -164,7 +166,7 @@ class Observer:
             displacement_um=self.displacement_um if self._by_optics else _good_quality_um(reading),
             guard_um=self.guard_um,
             laser_stuck=self.laser_stuck,
-            unseen_film=self.figures.describe_unseen() if self._by_optics else "",
+            unseen_film=self.figures.explain_unseen().text if self._by_optics else "",
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self.memory.laser_jumps.count,
             error_um=error_um,

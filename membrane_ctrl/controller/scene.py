@@ -14,6 +14,7 @@ from membrane_ctrl.controller import commands, interlocks, pump_obeys, safe_leve
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
 
 
@@ -52,7 +53,7 @@ class SceneState(StateNode):
     trim_um: float = 0.0
     laser_doubted: bool = False  # optics and gauge contradict it
     output: inner_loop.LoopOutput | None = None
-    why: str = ""
+    why: Reason = NO_REASON
     overdue: str = ""
     unfit: str = ""
     finished: errors.Exit | None = None
@@ -90,6 +91,10 @@ class Scene(SceneState):
         self.trial = None
         self.trial_memory = None
         self.trial_ended = None
+
+    def explain(self, code: WhyCode, text: str, *details: object) -> None:
+        """Set why the pump is as it is; details, as who asked, make it another reason."""
+        self.why = make_reason(code, text, *details)
 
     def give(self, output: inner_loop.LoopOutput) -> None:
         """Let the loop's output drive the pump, with the bleed open."""

@@ -10,12 +10,14 @@ from membrane_ctrl.control import centre_estimate, film, film_health, gas, inner
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
 from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.shape_loop import ShapeCode
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.protection import FilmSensor
 from membrane_ctrl.controller.redundancy import RedundancyState, RedundancyWatch
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
+from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
@@ -187,8 +189,16 @@ class SensorConsistency:
 
     @property
     def camera_lies(self) -> str:
-        """Readings of laser, gauge and camera, if the camera is wrong: a reason for the shape loop."""
+        """Readings of laser, gauge and camera, if the camera is wrong."""
         return self.memory.camera_lies
+
+    @property
+    def camera_distrust(self) -> Reason:
+        """Why the shape loop must not follow the camera; `NO_REASON` if it may."""
+        if not self.camera_lies:
+            return NO_REASON
+        code = ShapeCode.CAMERA_REPEATS if self.memory.repeats >= _REPEATS else ShapeCode.CAMERA_WRONG
+        return Reason(code, self.camera_lies)
 
     def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
         """Observe a tick and return its new events; judges only a held mirror."""

@@ -27,7 +27,7 @@ class ReportedShape(StateNode):
     """State and reason of the shape loop, as last reported."""
 
     state: ShapeState
-    reason: str  # without its numbers
+    reason_code: str
 
 
 @dataclass(slots=True)
@@ -42,8 +42,8 @@ class ControllerState(StateNode):
     state_since_s: float = math.nan
     fault: Count | None = None  # code of the standing fault's rule
     tick_error: str = ""
-    said_why: str = ""  # the operator's line as last reported, without its numbers
-    why_words: str = ""  # as it is
+    reported_why_code: str = ""  # of the operator's line as last reported
+    why_code: str = ""  # as it is
     why_since_s: float = 0.0
     reported_shape: ReportedShape | None = None
     setpoint_back_um: float = math.nan  # after a trial that steps the setpoint

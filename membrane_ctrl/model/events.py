@@ -36,9 +36,10 @@ class StateEntered(
 
 
 class Why(Event, kind="why", sentence="{why}"):
-    """The operator's line changed."""
+    """The operator's line changed; `code` names the reason (`reason.WhyCode`)."""
 
     why: str
+    code: str = ""
 
 
 class Fault(
@@ -91,10 +92,11 @@ class Resumed(Event, kind="resumed", sentence="Fault {name} is cleared by the re
 
 
 class ShapeLoopState(Event, kind="shape", sentence="Shape loop {state}[: {reason}]"):
-    """The shape loop's state, or the reason for it, changed."""
+    """The shape loop's state, or the reason for it, changed; `code` names the reason."""
 
     state: str
     reason: str
+    code: str = ""
 
 
 class CommandTaken(
@@ -178,11 +180,12 @@ class GainsReverted(
 
 
 class ExperimentEnded(Event, kind="experiment", sentence="Experiment {experiment} ended[: {reason}]", notable=True):
-    """An experiment is over."""
+    """An experiment is over; `end` is how (`machine.ExperimentEnd`)."""
 
     experiment: str
     completed: bool
     reason: str
+    end: str
 
 
 class Plausibility(

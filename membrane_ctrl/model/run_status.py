@@ -8,6 +8,7 @@ from typing import Any
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.notices import SHOWN_WITH_DETAILS, Notice, NoticeKey, Notices, Topic, apply_changes
+from membrane_ctrl.model.reason import WhyCode
 from membrane_ctrl.model.telemetry import TelemetryRow
 
 
@@ -18,6 +19,7 @@ class RunStatus:
     row: TelemetryRow | None = None  # of the newest tick; None before the first one
     since_s: float = 0.0  # when the run entered its state
     why: str = ""  # the controller's last reason
+    why_code: str = ""  # of it, while its state lasts
     fault: events.Fault | None = None  # the standing fault
     last_fault: events.Fault | None = None  # the newest fault
     last_fault_s: float = math.nan  # its time
@@ -33,6 +35,11 @@ class RunStatus:
     latched: str = ""  # a fault of an earlier run that waits for `ack`
     trial_ends_s: float = math.nan  # when gains on trial are reverted; NaN: none are
     ended: bool = False
+
+    @property
+    def paused(self) -> bool:
+        """Whether a person paused the loop."""
+        return self.why_code == WhyCode.PAUSED
 
     @property
     def trial_left_s(self) -> float:
@@ -65,10 +72,10 @@ class RunStatus:
         """What an event changes besides notices."""
         match event:
             case events.Why():
-                return replace(self, why=event.why)
+                return replace(self, why=event.why, why_code=event.code)
             case events.StateEntered():
                 fault = None if event.from_ == "fault" else self.fault
-                return replace(self, why=event.why, fault=fault)
+                return replace(self, why=event.why, why_code="", fault=fault)
             case events.Fault():
                 return replace(self, fault=event, last_fault=event, last_fault_s=mono_s, faults=self.faults + 1)
             case events.Cleared():

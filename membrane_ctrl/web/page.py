@@ -234,8 +234,8 @@ class WebPage:
         """The console's keys: h, p, m, s."""
         if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
             return
-        why = str(self._feed.seen.status.get("why", ""))
-        wanted = {"h": "hold", "p": "resume" if "pause" in why else "pause", "m": "mark", "s": "stop"}
+        paused = bool(self._feed.seen.status.get("paused"))
+        wanted = {"h": "hold", "p": "resume" if paused else "pause", "m": "mark", "s": "stop"}
         action = next((a for a in (*ACTIONS, STOP) if a.do == wanted.get(str(event.key))), None)
         if action is not None and may(self._user, self._feed.seen.role, action):
             await self._confirm(action)

@@ -342,9 +342,9 @@ def _speaks(event: events.Event) -> str:
             return event.name
         case events.Plausibility() if event.liar != "nobody":
             return f"sensors: {event.liar}"
-        case events.ShapeLoopState() if "limit" in event.reason:
+        case events.ShapeLoopState(code=ShapeCode.TRIM_LIMIT):
             return "shape: trim at its limit"
-        case events.ShapeLoopState() if "repeats" in event.reason:
+        case events.ShapeLoopState(code=ShapeCode.CAMERA_REPEATS):
             return "shape: the camera repeats"
         case events.Maintenance():
             return f"maintenance: {event.name}"

@@ -135,7 +135,7 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     assert line(view).endswith(view.go_on)
     model.take_row(HOLDING)
     assert model.view(0.0).go_on == ""
-    model.take_event(event(0.0, "why", why="paused: the pump keeps its mean flow"))
+    model.take_event(event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused"))
     assert model.view(0.0).paused
     assert model.view(0.0).go_on.endswith("resume` or key p")
 

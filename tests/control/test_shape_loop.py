@@ -11,7 +11,15 @@ import pytest
 
 from benchmarks.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
-from membrane_ctrl.control.shape_loop import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES, ShapeLoop, ShapeOutput
+from membrane_ctrl.control.shape_loop import (
+    SHAPES,
+    TRACKED_EVERY_S,
+    TRACKED_SHAPES,
+    ShapeCode,
+    ShapeLoop,
+    ShapeOutput,
+)
+from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -57,11 +65,11 @@ def tracking() -> Bench:
 
 def test_reference_is_taken_first() -> None:
     bench = Bench()
-    assert bench.run(1.0).reason == "waiting for the first shape"
+    assert bench.run(1.0).reason.code == ShapeCode.WAITING
     out = bench.run(SHAPES * PERIOD_S - 2.0)
-    assert (out.state, out.reason) == (ShapeState.WAITING, f"reference: shape {SHAPES - 1} of {SHAPES}")
+    assert (out.state, out.reason.text) == (ShapeState.WAITING, f"reference: shape {SHAPES - 1} of {SHAPES}")
     out = bench.run(PERIOD_S)
-    assert (out.state, out.reason, out.trim_um) == (ShapeState.TRACKING, "", 0.0)
+    assert (out.state, out.reason, out.trim_um) == (ShapeState.TRACKING, NO_REASON, 0.0)
     assert math.isnan(out.sag_change_um)
 
 
@@ -74,12 +82,12 @@ def test_single_frames_make_a_reference_of_as_many_readings() -> None:
         if out.state == ShapeState.TRACKING:
             break
     assert bench.now_s == pytest.approx((TRACKED_SHAPES - 1) * TRACKED_EVERY_S, abs=1.3)
-    assert bench.loop.step(12.0, 0.05, None, 0.0, True).reason == ""
+    assert bench.loop.step(12.0, 0.05, None, 0.0, True).reason == NO_REASON
 
 
 def test_nothing_is_learnt_before_the_loop_is_settled() -> None:
     out = Bench().run(60.0, settled=False)
-    assert (out.state, out.reason) == (ShapeState.WAITING, "the inner loop is not settled")
+    assert (out.state, out.reason.code) == (ShapeState.WAITING, ShapeCode.NOT_SETTLED)
 
 
 def test_trim_goes_to_the_lasers_drift(tracking: Bench) -> None:
@@ -110,7 +118,7 @@ def test_trim_is_bounded_in_range_and_says_so() -> None:
     bench.bias_um = 5.0
     out = bench.run(300.0)
     assert (out.trim_um, out.state) == (2.0, ShapeState.TRACKING)
-    assert "limit" in out.reason
+    assert out.reason.code == ShapeCode.TRIM_LIMIT
     bench.bias_um = 0.0
     assert bench.run(600.0).trim_um == pytest.approx(0.0, abs=0.02)
 
@@ -134,7 +142,7 @@ def test_suspended_with_a_reason_and_the_trim_held(tracking: Bench, change: dict
     held_um = tracking.run(600.0).trim_um
     out = tracking.run(2 * PERIOD_S + 0.1, **change)
     assert out.state == ShapeState.SUSPENDED
-    assert word in out.reason
+    assert word in out.reason.text
     out = tracking.run(60.0, **change)
     assert (out.state, out.trim_um) == (ShapeState.SUSPENDED, pytest.approx(held_um, abs=0.1))
     assert len(set(tracking.trims_um[-500:])) == 1
@@ -156,7 +164,7 @@ def test_degraded_shape_is_used(tracking: Bench) -> None:
 def test_no_shapes_is_noticed(tracking: Bench) -> None:
     assert tracking.run(CONFIG.fresh_s - 1.0, shapes=False).state == ShapeState.TRACKING
     out = tracking.run(5.0, shapes=False)
-    assert (out.state, out.reason) == (ShapeState.SUSPENDED, "no shape younger than 15 s")
+    assert (out.state, out.reason) == (ShapeState.SUSPENDED, Reason(ShapeCode.NO_SHAPE, "no shape younger than 15 s"))
     assert out.age_s > CONFIG.fresh_s
 
 
@@ -164,14 +172,14 @@ def test_shape_from_before_settling_is_not_used(tracking: Bench) -> None:
     tracking.run(0.1, settled=False)
     out = tracking.loop.step(tracking.now_s + DT_S, DT_S, tracking.estimate(), 0.0, True)
     assert out.state == ShapeState.SUSPENDED
-    assert "settled" in out.reason
+    assert out.reason.code == ShapeCode.MOVED_MEANWHILE
 
 
 def test_repeated_shape_is_not_used_twice(tracking: Bench) -> None:
     estimate = tracking.estimate()
     tracking.loop.step(tracking.now_s + 0.1, DT_S, estimate, 0.0, True)
     out = tracking.loop.step(tracking.now_s + 0.2, DT_S, estimate, 0.0, True)
-    assert (out.state, out.reason) == (ShapeState.SUSPENDED, "the shape is not newer than the last one")
+    assert (out.state, out.reason.code) == (ShapeState.SUSPENDED, ShapeCode.NOT_NEWER)
 
 
 def test_off_holds_the_trim_and_on_goes_on_from_it(tracking: Bench) -> None:
@@ -180,7 +188,7 @@ def test_off_holds_the_trim_and_on_goes_on_from_it(tracking: Bench) -> None:
     tracking.loop.switch(False, tracking.now_s)
     tracking.bias_um = 7.0
     out = tracking.run(60.0)
-    assert (out.state, out.reason, out.trim_um) == (ShapeState.OFF, "switched off", held_um)
+    assert (out.state, out.reason.code, out.trim_um) == (ShapeState.OFF, ShapeCode.SWITCHED_OFF, held_um)
     tracking.loop.switch(True, tracking.now_s)
     out = tracking.run(60.0)
     assert (out.state, out.trim_um) == (ShapeState.TRACKING, pytest.approx(held_um))

@@ -212,7 +212,7 @@ def test_a_figure_counts_only_if_it_shows_the_film_now(spoil: Callable[[Any, int
         watching.look(TickInputs(now_s=now_s, dt_s=0.02, reading=None, estimate=figure))
         if watching.unseen:
             assert math.isnan(watching.displacement_um)
-            why.append(watching.unseen)
+            why.append(watching.unseen.text)
         else:
             assert abs(watching.displacement_um) < 20 or why
     assert why == [] if not seen else why[0].startswith(seen)

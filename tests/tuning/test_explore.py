@@ -108,7 +108,9 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     loop_model.save_record(opened.file("experiments.npz"), record)
     around = machine.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
-    head = session.ExperimentsHead(around, ends_s, (ends_s, ends_s), machine.Finished(True, "done"))
+    head = session.ExperimentsHead(
+        around, ends_s, (ends_s, ends_s), machine.Finished(machine.ExperimentEnd.COMPLETED, "done")
+    )
     folder.write(opened.file("experiments.json"), head)
     session.identify_step(opened)
     quiet = quiet_hold()

@@ -277,12 +277,12 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
     noise stop sound experiments, too.
     """
     done: Record | None = None
-    finished = machine.Finished(False, "")
+    finished = machine.Finished(machine.ExperimentEnd.INTERRUPTED, "")
     for _ in range(plan.relays):
         relay, finished = rig.perform(spec_of("relay", around, plan.relay_s))
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
         done = relay if done is None else done.followed_by(relay)
-        if finished.reason.startswith(machine.NO_ANSWER) and not finished.completed:
+        if finished.end is machine.ExperimentEnd.NO_RESPONSE:
             otherwise = f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}"
             raise ExperimentError(otherwise, pump_suspected=True)
         try:
@@ -298,7 +298,7 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or bent(done, found)):
             break
     if done is None or not _enough(done, plan):
-        stopped_near = finished.reason.startswith(machine.STOPPED)
+        stopped_near = finished.end is machine.ExperimentEnd.STOPPED_BY_GUARD
         raise ExperimentError(finished.reason + (f": {_FURTHER}" if stopped_near else ""))
     return done, finished
 

@@ -8,6 +8,7 @@ stood.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from itertools import product
 from typing import Protocol
 
@@ -31,16 +32,31 @@ FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed, f
 # A moving mirror continues for the pump's delay and lag after the flow is reduced: 0.24 s, up to twice that on a slow
 # bench, unless more is known; pulses turn within the longest
 _LATE_S, _LATE_MOST_S = 0.4, 1.0
-STOPPED = "stopped at"  # begins the reason of an experiment that the guard ended
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
+
+
+class ExperimentEnd(StrEnum):
+    """How an experiment ended."""
+
+    COMPLETED = "completed"
+    STOPPED_BY_GUARD = "stopped_by_guard"  # the mirror moved too far
+    NO_RESPONSE = "no_response"  # the mirror did not move
+    READING_LOST = "reading_lost"
+    OVERDUE = "overdue"
+    INTERRUPTED = "interrupted"  # by a person, the safety table or another state
 
 
 @dataclass(frozen=True, slots=True)
 class Finished(StateNode):
-    """The end of an experiment: completed, or the reason and a remedy."""
+    """The end of an experiment, with a reason and a remedy for people."""
 
-    completed: bool
+    end: ExperimentEnd
     reason: str
+
+    @property
+    def completed(self) -> bool:
+        """Whether it ran as long as it was meant to."""
+        return self.end is ExperimentEnd.COMPLETED
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +211,7 @@ class ExcursionGuard:
             lost = (
                 f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the camera), then repeat"
             )
-            return self.memory.ended or Finished(False, lost)
+            return self.memory.ended or Finished(ExperimentEnd.READING_LOST, lost)
         off_um = self._motion.position_um - self._centre_um
         if self.memory.ended is None:
             found = self._guarded(off_um, measurement, dt_s)
@@ -213,8 +229,8 @@ class ExcursionGuard:
         coming_um = off_um + self._motion.coast_s * self._motion.speed_um_per_s
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
-                False,
-                f"{STOPPED} {off_um:+.1f} um, moving at {self._motion.speed_um_per_s:+.1f} um/s: the limit of "
+                ExperimentEnd.STOPPED_BY_GUARD,
+                f"stopped at {off_um:+.1f} um, moving at {self._motion.speed_um_per_s:+.1f} um/s: the limit of "
                 f"{self._limit_um:g} um was near; something else moved the mirror, or the pump is much stronger "
                 "than configured",
             )
@@ -255,7 +271,7 @@ class Patterned:
         """One tick of the pattern."""
         memory = self.memory
         if memory.time_s >= self._duration_s:
-            return Finished(True, "done")
+            return Finished(ExperimentEnd.COMPLETED, "done")
         self._motion.update(measurement.displacement_um, dt_s)
         back_um_per_s = _PULL_PER_S * (self._centre_um - self._motion.position_um)
         pattern_um_per_s = self._pattern(memory.time_s)
@@ -296,7 +312,6 @@ _FIRST_MAX_UM_PER_S = 1.5
 _OVERSHOOT_LEAST_UM = 0.2  # smaller ones are noise
 # A half cycle of 5 um takes this long if leak + bleed are 0.06 um/s, where no mirror can be held.
 _PATIENCE_S = 90.0
-NO_ANSWER = "the mirror did not"  # begins the reason of a relay that waited in vain
 
 
 @dataclass(slots=True)
@@ -356,7 +371,7 @@ class Relay:
         memory = self.memory
         self._motion.update(measurement.displacement_um, dt_s)
         if memory.time_s >= self._duration_s:
-            return Finished(True, f"{memory.crossings} crossings")
+            return Finished(ExperimentEnd.COMPLETED, f"{memory.crossings} crossings")
         memory.time_s += dt_s
         memory.since_switch_s += dt_s
         off_um = self._motion.position_um - self._centre_um
@@ -371,7 +386,8 @@ class Relay:
             way = "rise" if memory.rises else "sink"
             open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
             remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
-            return Finished(False, f"{NO_ANSWER} {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}")
+            still = f"the mirror did not {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}"
+            return Finished(ExperimentEnd.NO_RESPONSE, still)
         half = memory.up if memory.rises else memory.down
         return around.within(around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s)
 

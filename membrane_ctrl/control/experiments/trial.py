@@ -82,7 +82,7 @@ class PumpSteps:
             memory.steps_done += 1
             memory.in_step_s = 0.0
         if memory.steps_done == len(self._steps):
-            return machine.Finished(True, "pump mapped")
+            return machine.Finished(machine.ExperimentEnd.COMPLETED, "pump mapped")
         return self._steps[memory.steps_done].fraction
 
     def _over(self) -> bool:
@@ -228,6 +228,7 @@ class Trial:
         self.memory.left_s -= dt_s
         if self.raw and self.memory.left_s < 0:
             return machine.Finished(
-                False, f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump"
+                machine.ExperimentEnd.OVERDUE,
+                f"not done within {self.spec.duration_s:g} s: allow more time, or check the pump",
             )
         return self._guard.step(measurement, dt_s)
