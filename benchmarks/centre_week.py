@@ -56,7 +56,7 @@ class Change:
         """A loss and its end are told by an event each, a knock by the jump and its judgement, all else by none."""
         jumps = [words for words in self.held_by if ";" in words]
         if self.kind == "knock":
-            return len(jumps) == 1 and self.liars == ["laser", "nobody"]
+            return len(jumps) == 1 and self.liars == ["laser", "none"]
         plain = [TOLD[self.kind] in words for words in self.held_by] if self.kind in TOLD else self.held_by
         if self.kind in TOLD and self.lasts_s > TOLD_AFTER_S:
             return plain == [not self.begins]
@@ -199,9 +199,9 @@ class _Week:
             self.day.notices.append(f"{now_s:.0f} s {event.name}")
         last = self._open[-1][0] if self._open else None
         if isinstance(event, HeldBy) and last:
-            last.held_by.append(f"{event.sensors}; {event.jumped}" if event.jumped else event.sensors)
+            last.held_by.append("; ".join(filter(None, (", ".join(event.sensors), ", ".join(event.jumped)))))
         if isinstance(event, Plausibility) and last:
-            last.liars.append(event.liar)
+            last.liars.append(event.faulty)
         if isinstance(event, HeldBy | Plausibility) and not last:
             self.day.notices.append(f"{now_s:.0f} s {event}")
 

@@ -16,7 +16,15 @@ from membrane_ctrl.controller.protection import FilmSensor
 from membrane_ctrl.controller.redundancy import RedundancyState, RedundancyWatch
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.tick import TickInputs
-from membrane_ctrl.model.events import Event, HeldBy, Maintenance, MaintenanceOver, Plausibility, PumpLearned
+from membrane_ctrl.model.events import (
+    Event,
+    FaultySensor,
+    HeldBy,
+    Maintenance,
+    MaintenanceOver,
+    Plausibility,
+    PumpLearned,
+)
 from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -25,6 +33,12 @@ from membrane_ctrl.model.telemetry import ShapeState, State
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
 # No two cycles have the same noise; a shape that appears twice may be a repeated message
 _REPEATS = 3
+_FAULTY = {
+    film.Liar.NOBODY: FaultySensor.NONE,
+    film.Liar.UNSURE: FaultySensor.UNKNOWN,
+    film.Liar.LASER: FaultySensor.LASER,
+    film.Liar.OPTICS: FaultySensor.OPTICS,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -389,7 +403,7 @@ class SensorConsistency:
             return []
         self.memory.liar = liar
         seen = str(self._plausibility.changes) if self._plausibility.watching else "compared anew from here on"
-        return [Plausibility(liar.name.lower(), seen)]
+        return [Plausibility(_FAULTY[liar], seen)]
 
 
 def _of_warning(warning: film_health.FilmWarning) -> Event:
@@ -661,4 +675,4 @@ class Holders:
             return []
         memory.told = seeing
         memory.news_s = math.nan
-        return [HeldBy(", ".join(Sensor(n).name.lower() for n in seeing), ", ".join(jumped))]
+        return [HeldBy(tuple(Sensor(n).name.lower() for n in seeing), tuple(jumped))]

@@ -156,7 +156,9 @@ class Event:
 
 
 def _numbers_in(value: object) -> Iterator[float]:
-    if isinstance(value, bool | int | float):
+    if isinstance(value, StrEnum):
+        yield float(list(type(value)).index(value))
+    elif isinstance(value, bool | int | float):
         yield float(value)
     elif isinstance(value, Mapping):
         for key in sorted(value):

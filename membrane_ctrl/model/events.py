@@ -1,5 +1,6 @@
 """Events of the controller, one class per kind; `run_events` has those of the other processes."""
 
+from enum import StrEnum
 from typing import Any
 
 from membrane_ctrl.model.event_base import Event as Event
@@ -188,29 +189,38 @@ class ExperimentEnded(Event, kind="experiment", sentence="Experiment {experiment
     end: str
 
 
+class FaultySensor(StrEnum):
+    """Which sensor contradicts the others."""
+
+    NONE = "none"
+    UNKNOWN = "unknown"
+    LASER = "laser"
+    OPTICS = "optics"
+
+
 class Plausibility(
     Event,
     kind="plausibility",
-    sentence="Laser and camera disagree[, {culprit} is wrong][ ({seen})]. Do: check the laser's mount, the camera "
-    "and the screen",
+    sentence="Laser and camera disagree[, {culprit} is wrong][ ({readings})]. Do: check the laser's mount, the "
+    "camera and the screen",
     level=LogLevel.WARNING,
     opens=(Topic.PLAUSIBILITY,),
     closes=(Topic.PLAUSIBILITY,),
 ):
-    """Which of laser, gauge and camera is wrong now, if any."""
+    """Which of laser, gauge and camera is wrong now, if any (`FaultySensor`)."""
 
-    liar: str
-    seen: str
+    faulty: FaultySensor
+    readings: str
 
     @property
     def stands(self) -> bool:
         """Whether one of them is wrong."""
-        return self.liar != "nobody"
+        return self.faulty is not FaultySensor.NONE
 
     @property
     def culprit(self) -> str:
         """The wrong one; empty if that is not known."""
-        return {"laser": "the laser", "optics": "the camera"}.get(self.liar, "")
+        return {FaultySensor.LASER: "the laser", FaultySensor.OPTICS: "the camera"}.get(self.faulty, "")
 
     @property
     def level(self) -> LogLevel:
@@ -218,14 +228,14 @@ class Plausibility(
         return LogLevel.WARNING if self.stands else LogLevel.INFO
 
     def _choose_template(self) -> str:
-        return self._template if self.stands else "Laser and camera agree again[ ({seen})]"
+        return self._template if self.stands else "Laser and camera agree again[ ({readings})]"
 
 
 class HeldBy(Event, kind="held_by", sentence="The mirror is held by {sensors}[; jumped: {jumped}]"):
-    """Which sensors the estimate of the centre follows now, and which of them have jumped."""
+    """Which sensors the estimate of the centre follows now, and which of them have jumped, with the distance."""
 
-    sensors: str
-    jumped: str
+    sensors: tuple[str, ...]
+    jumped: tuple[str, ...]
 
 
 class Maintenance(

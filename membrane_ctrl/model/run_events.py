@@ -2,7 +2,8 @@
 
 import json
 import math
-from typing import Any
+from enum import StrEnum
+from typing import Any, get_origin
 
 from membrane_ctrl.model.event_base import KINDS, Event, EventLine, LogLevel, UnknownEvent
 from membrane_ctrl.model.notices import GLITCH_S, NoticeChanges, NoticeKey, Notices, Topic
@@ -466,13 +467,23 @@ def from_dict(line: EventLine) -> Event:
     cls = KINDS.get(line["kind"]) if isinstance(line.get("kind"), str) else None
     if cls is None:
         return UnknownEvent(line)
-    values = {}
-    for field, key in cls.keys:
-        value = values[field.name] = line[key] if key in line else _EMPTY.get(field.type)
-        if not _fits(value, field.type):
-            return UnknownEvent(line)
+    try:
+        values = {field.name: _read_value(line, key, field.type) for field, key in cls.keys}
+    except ValueError:
+        return UnknownEvent(line)
     return cls(**values)
 
 
-def _fits(value: object, hint: Any) -> bool:
-    return hint is Any or isinstance(value, hint) or (isinstance(value, int) and isinstance(0.0, hint))
+def _read_value(line: EventLine, key: str, hint: Any) -> object:
+    """The value of a key, of its declared type. Raises ValueError if it is of another type."""
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return hint(line[key]) if key in line else next(iter(hint))
+    if get_origin(hint) is tuple:
+        texts = line.get(key, ())
+        if not isinstance(texts, list | tuple) or not all(isinstance(text, str) for text in texts):
+            raise ValueError(f"{key} is no list of texts")
+        return tuple(texts)
+    value = line[key] if key in line else _EMPTY.get(hint)
+    if hint is Any or isinstance(value, hint) or (isinstance(value, int) and isinstance(0.0, hint)):
+        return value
+    raise ValueError(f"{key} is of another type")

@@ -42,8 +42,8 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "port_open"}, [("port", False, "warning")]),
         ({"kind": "maintenance", "name": "creep", "message": "x"}, [("maintenance_creep", True, "warning")]),
         ({"kind": "maintenance_over", "name": "creep"}, [("maintenance_creep", False, "warning")]),
-        ({"kind": "plausibility", "liar": "laser", "seen": "x"}, [("plausibility", True, "warning")]),
-        ({"kind": "plausibility", "liar": "nobody"}, [("plausibility", False, "warning")]),
+        ({"kind": "plausibility", "faulty": "laser", "readings": "x"}, [("plausibility", True, "warning")]),
+        ({"kind": "plausibility", "faulty": "none"}, [("plausibility", False, "warning")]),
         ({"kind": "latch_failed", "message": "disk full"}, [("latch", True, "critical")]),
         ({"kind": "latch_written"}, [("latch", False, "warning")]),
         ({"kind": "lock", "word": "bofak"}, [("lock", True, "warning")]),
@@ -68,11 +68,11 @@ def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]
 
 
 @pytest.mark.parametrize(
-    ("liar", "says"),
-    [("laser", "the laser is wrong"), ("optics", "the camera is wrong"), ("unsure", "disagree (laser")],
+    ("faulty", "says"),
+    [("laser", "the laser is wrong"), ("optics", "the camera is wrong"), ("unknown", "disagree (laser")],
 )
-def test_who_is_wrong_is_said_in_the_operators_words(liar: str, says: str) -> None:
-    line = {"kind": "plausibility", "liar": liar, "seen": "laser +20.0 um, camera +0.1 um"}
+def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, says: str) -> None:
+    line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 um, camera +0.1 um"}
     (sign,) = signs_of(from_dict(line).notice_changes({}))
     assert says in sign.text
     assert "laser +20.0 µm" in sign.text

@@ -355,8 +355,8 @@ def _watch(run: VirtualRun, bench: VirtualBench, until_s: float, way_um: float) 
                     fault, after_s = event.name, run.now_s - since_s
                 case Maintenance() if not notice:
                     notice, notice_s, notice_um = event.name, run.now_s - since_s, away_um
-                case Plausibility() if not notice and event.liar != "nobody":
-                    notice, notice_s, notice_um = f"{event.liar} wrong", run.now_s - since_s, away_um
+                case Plausibility() if not notice and event.stands:
+                    notice, notice_s, notice_um = f"{event.faulty} wrong", run.now_s - since_s, away_um
         if state == State.FAULT and row.pump_fraction == 0.0:
             break
         if row.safe_level == SafeLevel.NONE and state != State.FAULT:

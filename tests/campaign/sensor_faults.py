@@ -341,8 +341,8 @@ def _speaks(event: events.Event) -> str:
     match event:
         case events.Fault():
             return event.name
-        case events.Plausibility() if event.liar != "nobody":
-            return f"sensors: {event.liar}"
+        case events.Plausibility() if event.stands:
+            return f"sensors: {event.faulty}"
         case events.ShapeLoopState(code=ShapeCode.TRIM_LIMIT):
             return "shape: trim at its limit"
         case events.ShapeLoopState(code=ShapeCode.CAMERA_REPEATS):

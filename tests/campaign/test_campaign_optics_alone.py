@@ -83,7 +83,7 @@ def test_rendered_frames_alone_start_settle_and_hold_a_mirror_through_another_an
         events += tick.events
     assert rows[-1].state == State.HOLD
     held = [event.sensors for event in events if isinstance(event, HeldBy)]
-    assert held[0] == "optics, barometer, thermometer"
+    assert held[0] == ("optics", "barometer", "thermometer")
     assert [event.name for event in events if isinstance(event, Fault)] == ["film_unseen"]  # during the anchor
     time_s, true_um = np.array([(row.mono_s, row.truth_displacement_um) for row in rows]).T
     before = true_um[(time_s > 27.0) & (time_s < 42.0)]

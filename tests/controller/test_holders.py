@@ -50,7 +50,7 @@ def moved_um(ticks: list[VirtualTick]) -> float:
 
 def told(ticks: list[VirtualTick]) -> list[str]:
     """Which sensors hold the mirror, as it was told."""
-    return [event.sensors for tick in ticks for event in tick.events if isinstance(event, HeldBy)]
+    return [", ".join(event.sensors) for tick in ticks for event in tick.events if isinstance(event, HeldBy)]
 
 
 ALL = "laser, optics, barometer, thermometer"

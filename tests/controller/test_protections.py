@@ -266,7 +266,7 @@ def test_a_figure_that_cannot_be_used_counts_as_missing(spoil: Spoil, process_va
 @pytest.mark.parametrize("um_per_s", [-0.05, 0.05])
 def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float) -> None:
     held = settled(config_of("estimate"), drifting(um_per_s)).fail(1200.0)
-    assert [event.liar for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
+    assert [event.faulty for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
     assert held.moved_um < 40.0
     assert held.faults == []
     assert abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 20.0  # most of it is undone
@@ -334,7 +334,7 @@ def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoi
     held = settled(config_of("estimate"), spoil)
     held.command(UNDERTAKINGS[undertaking])
     held.fail(90.0)
-    assert "optics" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    assert "optics" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
     way_um = 40.0 if undertaking == "setpoint" else 0.0
     moved_um = np.array([tick.row.truth_displacement_um for tick in held.ticks]) - held.start_um
     assert moved_um.max() < way_um + 35.0
@@ -406,7 +406,7 @@ def test_a_laser_that_is_knocked_again_and_again_does_not_lead_the_film() -> Non
 
     held = settled(config_of("estimate")).fail(300.0, knock)
     assert held.moved_um < 20.0
-    assert "laser" in [event.liar for event in held.told(Plausibility)]  # type: ignore[attr-defined]
+    assert "laser" in [event.faulty for event in held.told(Plausibility)]  # type: ignore[attr-defined]
 
 
 def leak_more(wrong: Wrong, since_s: float) -> None:

@@ -42,7 +42,7 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
         ),
         ({"kind": "no_claim", "message": "the board\ncannot"}, "The board cannot"),
         (
-            {"kind": "plausibility", "liar": "nobody", "seen": "laser +1.0 um"},
+            {"kind": "plausibility", "faulty": "none", "readings": "laser +1.0 um"},
             "Laser and camera agree again (laser +1.0 µm)",
         ),
         # not as expected: the fields, whatever they are
@@ -71,8 +71,8 @@ def test_every_sentence_uses_the_fields_and_properties_of_its_event(cls: type[Ev
         ({"kind": "acquisition", "state": "retrying"}, "WARN"),
         ({"kind": "link", "up": False}, "WARN"),
         ({"kind": "link", "up": True}, "INFO"),
-        ({"kind": "plausibility", "liar": "laser"}, "WARN"),
-        ({"kind": "plausibility", "liar": "nobody"}, "INFO"),
+        ({"kind": "plausibility", "faulty": "laser"}, "WARN"),
+        ({"kind": "plausibility", "faulty": "none"}, "INFO"),
         ({"kind": "command", "command": "hold", "refused": "no"}, "WARN"),
         ({"kind": "state"}, "INFO"),
     ],

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.model.event_base import KINDS, Event, UnknownEvent
-from membrane_ctrl.model.events import CommandTaken, Fault, StateEntered
+from membrane_ctrl.model.events import CommandTaken, Fault, FaultySensor, HeldBy, Plausibility, StateEntered
 from membrane_ctrl.model.run_events import Capture, CommanderChanged, from_dict
 
 
@@ -67,3 +67,20 @@ def test_the_numbers_of_a_table_come_in_the_order_of_its_keys() -> None:
     one = CommandTaken("gains", "ann", "", 60.0, loop={"ti_s": 2.0, "pump": {"scale": [1, 2]}, "name": "x"})
     other = CommandTaken("gains", "bob", "", 60.0, loop={"pump": {"scale": (1, 2)}, "name": "y", "ti_s": 2.0})
     assert one.numbers() == other.numbers() == (60.0, 1.0, 2.0, 2.0)
+
+
+def test_codes_come_back_as_their_class_and_count_among_the_numbers() -> None:
+    event = from_dict({"kind": "plausibility", "faulty": "laser", "readings": "x"})
+    assert isinstance(event, Plausibility)
+    assert event.faulty is FaultySensor.LASER
+    assert event.numbers() == (2.0,)
+    assert json.loads(json.dumps(event.to_dict()))["faulty"] == "laser"
+    assert isinstance(from_dict({"kind": "plausibility", "faulty": "of tomorrow"}), UnknownEvent)
+
+
+def test_lists_come_back_as_they_were() -> None:
+    held = HeldBy(("laser", "optics"), ("laser +12 um",))
+    assert from_dict(json.loads(json.dumps(held.to_dict()))) == held
+    assert held.sentence == "The mirror is held by laser, optics; jumped: laser +12 µm"
+    for sensors in ("laser", [1], {"laser": 1}):
+        assert isinstance(from_dict({"kind": "held_by", "sensors": sensors}), UnknownEvent)

@@ -4,8 +4,9 @@ import argparse
 import inspect
 import sys
 from dataclasses import MISSING
+from enum import StrEnum
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Any
 
 from membrane_ctrl.model import events, run_events
@@ -14,7 +15,14 @@ from membrane_ctrl.model.notices import NoticeKey, Topic
 
 PAGE = Path(__file__).parents[2] / "docs" / "events.md"
 _NOT_RECORDED = frozenset({"alive"})  # between processes only
-_TYPES = {str: "text", int: "integer", float: "number", bool: "true or false", Any: "any"}
+_TYPES = {
+    str: "text",
+    int: "integer",
+    float: "number",
+    bool: "true or false",
+    tuple[str, ...]: "list of texts",
+    Any: "any",
+}
 _BY_SUBJECT = {Topic.CHILD: "CHILD_ended", Topic.MAINTENANCE: "maintenance_NAME"}
 _INTRODUCTION = """\
 Generated from `membrane_ctrl/model/events.py` and `run_events.py` (`make generate`). An event is one class; its lines
@@ -55,11 +63,18 @@ def _row(kind: str, cls: type[Event]) -> str:
 
 
 def _describe_key(key: str, hint: Any, is_required: bool) -> str:
-    parts = hint.__args__ if isinstance(hint, UnionType) else (hint,)
-    words = " or ".join(
-        "null" if part is type(None) else _TYPES[part] for part in parts if is_required or part is not type(None)
-    )
+    types = hint.__args__ if isinstance(hint, UnionType) else (hint,)
+    shown = [each for each in types if is_required or each is not NoneType]
+    words = " or ".join(map(_describe_type, shown))
     return f"`{key}` {words}" if is_required else f"[`{key}` {words}]"
+
+
+def _describe_type(hint: Any) -> str:
+    if hint is NoneType:
+        return "null"
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return " or ".join(f"`{code.value}`" for code in hint)
+    return _TYPES[hint]
 
 
 def _name_alarm(topic: Topic) -> str:
