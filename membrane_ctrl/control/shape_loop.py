@@ -21,7 +21,7 @@ from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.filters import DriftTracker
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.reason import NO_REASON, Reason
+from membrane_ctrl.model.reason import NO_REASON, Reason, make_reason
 from membrane_ctrl.model.state_tree import ArrayShape, StateNode
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -148,7 +148,7 @@ class ShapeCode(StrEnum):
     TRIM_LIMIT = "trim_limit"
 
 
-_SWITCHED_OFF = Reason(ShapeCode.SWITCHED_OFF, "switched off")
+_SWITCHED_OFF = make_reason(ShapeCode.SWITCHED_OFF, "switched off")
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ class ShapeLoop:
         """Take the figure from now on as the reference; hold the trim meanwhile."""
         memory = self.memory
         memory.state = telemetry.ShapeState.WAITING
-        memory.reason = Reason(ShapeCode.WAITING, "waiting for the first shape")
+        memory.reason = make_reason(ShapeCode.WAITING, "waiting for the first shape")
         memory.reference = ReferenceMean()
         memory.change = SagChange(math.nan, math.nan)
         memory.admitted_s = math.nan
@@ -265,26 +265,26 @@ class ShapeLoop:
         """Why this tick's estimate must not be used; `NO_REASON` if it may be."""
         config = self._config
         if not settled:
-            return Reason(ShapeCode.NOT_SETTLED, "the inner loop is not settled")
+            return make_reason(ShapeCode.NOT_SETTLED, "the inner loop is not settled")
         if now_s - self.memory.seen_s > config.fresh_s:
-            return Reason(ShapeCode.NO_SHAPE, f"no shape younger than {config.fresh_s:g} s")
+            return make_reason(ShapeCode.NO_SHAPE, f"no shape younger than {config.fresh_s:g} s")
         if estimate is None:
             return NO_REASON
         if estimate.verdict == "rejected":
-            return Reason(ShapeCode.REJECTED, f"shape rejected: {estimate.reason}")
+            return make_reason(ShapeCode.REJECTED, f"shape rejected: {estimate.reason}")
         if estimate.time_s < self.memory.settled_since_s:
             meanwhile = "the shape was taken while the inner loop was not settled"
-            return Reason(ShapeCode.MOVED_MEANWHILE, meanwhile)
+            return make_reason(ShapeCode.MOVED_MEANWHILE, meanwhile)
         if estimate.time_s <= self.memory.admitted_s:
-            return Reason(ShapeCode.NOT_NEWER, "the shape is not newer than the last one")
+            return make_reason(ShapeCode.NOT_NEWER, "the shape is not newer than the last one")
         if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
-            return Reason(ShapeCode.NOT_FINITE, "the shape is not finite")
+            return make_reason(ShapeCode.NOT_FINITE, "the shape is not finite")
         moved_um = abs(displacement_um - estimate.displacement_um)
         if math.isnan(moved_um):
-            return Reason(ShapeCode.NO_LASER, "no laser reading to compare the shape with")
+            return make_reason(ShapeCode.NO_LASER, "no laser reading to compare the shape with")
         if moved_um > config.disagreement_max_um:
             moved = f"the laser has moved by {moved_um:.1f} um since the exposures"
-            return Reason(ShapeCode.LASER_MOVED, moved)
+            return make_reason(ShapeCode.LASER_MOVED, moved)
         return NO_REASON
 
     def _refuse(self, reason: Reason) -> None:
@@ -300,7 +300,7 @@ class ShapeLoop:
             memory.admitted_s = estimate.time_s
             reference.take(estimate)
             taken = f"reference: shape {reference.count} of {reference.wanted}"
-            memory.reason = Reason(ShapeCode.REFERENCE, taken)
+            memory.reason = make_reason(ShapeCode.REFERENCE, taken)
             if reference.complete:
                 memory.state = telemetry.ShapeState.TRACKING
                 memory.reason = NO_REASON
@@ -313,7 +313,7 @@ class ShapeLoop:
         apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
             apart = f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock again"
-            self._refuse(Reason(ShapeCode.DISAGREE, apart))
+            self._refuse(make_reason(ShapeCode.DISAGREE, apart))
             return
         memory.admitted_s = estimate.time_s
         memory.change = change
@@ -331,4 +331,4 @@ class ShapeLoop:
         memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)
         at_limit = bounded_um != goal_um
         limited = f"trim at its limit of {config.trim_max_um:g} um"
-        memory.reason = Reason(ShapeCode.TRIM_LIMIT, limited) if at_limit else NO_REASON
+        memory.reason = make_reason(ShapeCode.TRIM_LIMIT, limited) if at_limit else NO_REASON

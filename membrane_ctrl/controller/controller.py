@@ -31,13 +31,13 @@ from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
 from membrane_ctrl.model.lock import describe_locks
-from membrane_ctrl.model.reason import NO_REASON, Reason
+from membrane_ctrl.model.reason import NO_REASON, make_reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 # range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
-_WITHOUT_LASER = Reason(
+_WITHOUT_LASER = make_reason(
     shape_loop.ShapeCode.NO_MOUNT, "there is no laser whose mount could drift: the optics themselves are held"
 )
 _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
@@ -437,7 +437,7 @@ class Controller:
         experiment = self._scene.trial
         assert experiment is not None
         ended = self._scene.trial_ended or machine.Finished(machine.ExperimentEnd.INTERRUPTED, why)
-        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, ended.end))
+        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, ended.end.value))
 
     def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""

@@ -8,7 +8,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
 from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
 from membrane_ctrl.controller.jumps import JumpGate
-from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode
+from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
 
 _SLACK_PA = 20.0  # below it a slack film's gauge may repeat its zero for hours
@@ -147,7 +147,7 @@ class Observer:
         if self._by_optics:
             return self.figures.explain_unseen()
         quality = self.reading.displacement_quality if self.reading else "unknown"
-        return Reason(WhyCode.NO_READING, f"no valid laser reading (quality {quality})")
+        return make_reason(WhyCode.NO_READING, f"no valid laser reading (quality {quality})")
 
     @property
     def waited_s(self) -> float:

@@ -25,7 +25,7 @@ from membrane_ctrl.model.events import (
     Plausibility,
     PumpLearned,
 )
-from membrane_ctrl.model.reason import NO_REASON, Reason
+from membrane_ctrl.model.reason import NO_REASON, Reason, make_reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
@@ -212,7 +212,7 @@ class SensorConsistency:
         if not self.camera_lies:
             return NO_REASON
         code = ShapeCode.CAMERA_REPEATS if self.memory.repeats >= _REPEATS else ShapeCode.CAMERA_WRONG
-        return Reason(code, self.camera_lies)
+        return make_reason(code, self.camera_lies)
 
     def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
         """Observe a tick and return its new events; judges only a held mirror."""

@@ -375,12 +375,12 @@ def _missing(scene: Scene) -> Reason:
     """What the checks still lack; `NO_REASON` if nothing is missing."""
     reading = scene.observer.reading
     if reading is None:
-        return Reason(WhyCode.NO_ANSWER, "no answer from the device")
+        return make_reason(WhyCode.NO_ANSWER, "no answer from the device")
     unseen = scene.observer.unseen
     if unseen != NO_REASON:
         return unseen
     if not math.isfinite(reading.gauge_pressure_pa):
-        return Reason(WhyCode.NO_GAUGE, "no gauge pressure")
+        return make_reason(WhyCode.NO_GAUGE, "no gauge pressure")
     if reading.latched_faults:
         faults = f"the board has latched faults {reading.latched_faults:#x}"
         return make_reason(WhyCode.BOARD_FAULTS, faults, reading.latched_faults)

@@ -63,7 +63,7 @@ class Reason(StateNode):
 
 def make_reason(code: str, text: str, *details: object) -> Reason:
     """Return a reason whose code is followed by details that make it another one, such as who asked."""
-    return Reason(".".join((code, *map(str, details))), text)
+    return Reason(".".join(map(str, (code, *details))), text)
 
 
 NO_REASON = Reason()
