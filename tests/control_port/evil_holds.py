@@ -60,6 +60,7 @@ ANSWERS: dict[str, bytes] = {
     "notice_part": status_line(notices=[{"topic": "recorder", "text": "x"}]),
     "notice_numbers": status_line(notices=[{"topic": "recorder", "subject": 1, "severity": 2, "text": 3}]),
     "recording_text": status_line(recording_ok="x"),
+    "paused_text": status_line(paused="no"),
     "state_list": status_line(state=["hold"]),
     "state_html": status_line(state="<img src=x onerror=alert(1)>"),
     "state_escape": status_line(state="hold\x1b[2J"),

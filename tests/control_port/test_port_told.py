@@ -6,7 +6,8 @@ from pathlib import Path
 
 from port_run import port_run
 
-from membrane_ctrl.model.events import Maintenance, MaintenanceOver
+from membrane_ctrl.model.events import Maintenance, MaintenanceOver, StateEntered, Why
+from membrane_ctrl.model.reason import WhyCode
 from membrane_ctrl.model.run_events import DiskLow, GeometryInForce, RecorderError, RecorderRecovered
 
 
@@ -42,3 +43,13 @@ async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_
         assert status["notices"] == []
         assert status["recording_ok"] is True
         assert "membrane_recording_ok 1.0" in run.port.metrics()
+
+
+async def test_a_pause_stands_in_the_status_until_the_reason_or_the_state_changes(tmp_path: Path) -> None:
+    async with port_run(tmp_path) as run:
+        assert run.port.status()["paused"] is False
+        for over in (Why("holding", "holding"), StateEntered("manual", "hold", "ann took over the pump")):
+            run.tick(events=(Why("whatever the text says", WhyCode.PAUSED),))
+            assert run.port.status()["paused"] is True
+            run.tick(events=(over,))
+            assert run.port.status()["paused"] is False
