@@ -84,7 +84,7 @@ def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind:
     assert held.state == State.TUNE
     held.until_hold(40.0)
     assert held.of("experiment")[-1] | {"mono_s": 0, "reason": ""} == {
-        "kind": "experiment", "experiment": kind, "completed": True, "reason": "", "mono_s": 0,
+        "kind": "experiment", "experiment": kind, "completed": True, "reason": "", "end": "completed", "mono_s": 0,
     }  # fmt: skip
     assert 1.0 < held.furthest_um(BEGIN_S) < 10.0
     held.go(30.0)
