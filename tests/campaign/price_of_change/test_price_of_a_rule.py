@@ -23,7 +23,7 @@ FIELD = '''\
     @property
     def gas_temperature_c(self) -> float:
         """Of the gas in the mirror; NaN without an answer."""
-        return self.reading.gas_temperature_c if self.reading else math.nan
+        return self.reading.gas_temperature_c
 
     @property
     def depth_um(self)'''
