@@ -25,8 +25,8 @@ from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
 from membrane_ctrl.sim.optics.trace import ScreenError
 
-# 16-bit frames of large pixels, each with the noise of the 64 of the paper's camera that it stands for
-SHRINK = 8
+# 16-bit frames of large pixels, each with the noise of the 256 of the paper's camera that it stands for
+SHRINK = 16
 NOISE = 256 * float(np.hypot(0.4, np.sqrt(1 / 12))) / SHRINK
 CAMERA = CameraConfig(
     width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK, bits=16, noise_adu=NOISE
@@ -195,6 +195,7 @@ def test_wrong_options_are_said(
     assert says in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_notes_sets_that_state_different_references(
     folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -321,6 +322,7 @@ def far_and_near(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [root / "far", root / "screen5", root / "screen8"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag(
     folders: list[Path],
     far_and_near: list[Path],
