@@ -285,7 +285,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         last = row.get("crashed") or row.get("default_error") or row.get("refused") or row.get("reason", "")
         why = "; then: ".join([*row.get("obeyed", ()), last or "kept"])
-        over = f"; excursion {row['excursion_um']:.1f} um" if _too_far(row) else ""
+        over = f"; excursion {row['excursion_um']:.1f} µm" if _too_far(row) else ""
         if outcome(row) != "kept" or over:
             lines.append(f"| {row['seed']}: {_short(row)} | {outcome(row)} | {why}{over} |")
     return "\n".join(lines)
@@ -313,8 +313,8 @@ def run(count: int = FRESH) -> list[Figure]:
 
 def _short(row: dict[str, Any]) -> str:
     return (
-        f"{row['shape']}, {row['full_um_per_s']:.1f} against {row['leak_um_per_s']:.1f} um/s, "
-        f"{row['delay_s']:.2f} + {row['lag_s']:.2f} s, laser {row['laser_um']:.1f} um, {row['rate_hz']:g} Hz"
+        f"{row['shape']}, {row['full_um_per_s']:.1f} against {row['leak_um_per_s']:.1f} µm/s, "
+        f"{row['delay_s']:.2f} + {row['lag_s']:.2f} s, laser {row['laser_um']:.1f} µm, {row['rate_hz']:g} Hz"
         f"{', gusty' if row['gusts'] else ''}"
     )
 

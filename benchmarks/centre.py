@@ -74,7 +74,7 @@ def hold(
 ) -> HeldCentre:
     """Hold the simulated mirror on the estimate; a laser is there for the first 10 s, then if `sensors` says so.
 
-    `shake`: amplitude in um and frequency in Hz of a sine that laser and optics see besides the centre.
+    `shake`: amplitude in µm and frequency in Hz of a sine that laser and optics see besides the centre.
     """
     plant = Plant(twin, true_pump, events)
     controller, centre = InnerLoop(loop, PumpConfig(), config), CentreFilter(config, loop)
@@ -121,7 +121,7 @@ CASES: dict[str, tuple[Sensors, dict[str, Any]]] = {
     "laser alone": (Sensors(optics=None), {}),
     "all, quiet": (Sensors(), {"scenario": "quiet"}),
     "all, gusty": (Sensors(), {"scenario": "gusty"}),
-    "all, mount drifts 2 um/min": (Sensors(), {"laser_drift_um_per_min": 2.0}),
+    "all, mount drifts 2 µm/min": (Sensors(), {"laser_drift_um_per_min": 2.0}),
     "all, frames at 1 Hz": (Sensors(optics=Optics(rate_hz=1.0)), {}),
     "all, frames at 75 Hz": (Sensors(optics=Optics(rate_hz=75.0)), {}),
     "all, without barometer and thermometer": (Sensors(weather=False), {}),
@@ -131,7 +131,7 @@ WITH_LEAK = ("all", "optics alone", "laser alone")  # the leak doubles in these,
 
 
 def steady(case: str, seed: int, duration_s: float, **changes: Any) -> dict[str, float]:
-    """Motion of the true centre in um after settling, and the estimate's error in standard deviations."""
+    """Motion of the true centre in µm after settling, and the estimate's error in standard deviations."""
     sensors = CASES[case][0]
     held = hold(sensors, _bench(case, seed), duration_s + SETTLED_S, **changes)
     late = held.time_s >= SETTLED_S
@@ -152,7 +152,7 @@ def _bench(case: str, seed: int) -> TwinConfig:
 
 
 def leak_doubled(case: str, seed: int, **changes: Any) -> float:
-    """Peak of the true centre in um after the leak doubles at 60 s, in quiet weather."""
+    """Peak of the true centre in µm after the leak doubles at 60 s, in quiet weather."""
     bench = TwinConfig(scenario="quiet", seed=seed, start_error_um=0.0)
     return float(np.abs(hold(CASES[case][0], bench, 90.0, [LeakChange(60.0)], **changes).after(60.0)).max())
 
@@ -188,7 +188,7 @@ def bound_um(case: str) -> float:
 
 
 def robust(draw: int, duration_s: float) -> float:
-    """Standard deviation in um on a bench whose gains, delay, lag and noises are up to 30 % off what is told."""
+    """Standard deviation in µm on a bench whose gains, delay, lag and noises are up to 30 % off what is told."""
     off = 1 + np.random.default_rng(draw).uniform(-0.3, 0.3, 8)
     told, loop = EstimatorConfig(), LoopConfig()
     twin = _bench("all", draw + 1).model_copy(
@@ -209,7 +209,7 @@ def robust(draw: int, duration_s: float) -> float:
     return float(held.after(SETTLED_S).std())
 
 
-# Targets by case: standard deviation in um, peak after a doubled leak in um.
+# Targets by case: standard deviation in µm, peak after a doubled leak in µm.
 TARGETS = {"all": (0.065, 0.6), "optics alone": (0.08, 0.7), "laser alone": (0.12, 1.7), "all, quiet": (0.03, None),
            "all, gusty": (0.22, None)}  # fmt: skip
 MOST_OVER_BOUND, MOVED_UM, MOST_WORSE, MOST_SENSITIVE = 1.4, 0.1, 1.5, 1.6

@@ -117,8 +117,8 @@ class Compared:
             f"{bench.weather:.1f}{', gusty' if bench.gusts else ''}{'' if bench.barometer else ', no barometer'}"
         )
         return (
-            f"| {bench.seed}: {bench.shape}, {bench.full_um_per_s:.1f} against {bench.leak_um_per_s:.1f} um/s, "
-            f"{bench.delay_s:.2f} + {bench.lag_s:.2f} s, laser {bench.laser_um:.1f} um, {bench.rate_hz:g} Hz, "
+            f"| {bench.seed}: {bench.shape}, {bench.full_um_per_s:.1f} against {bench.leak_um_per_s:.1f} µm/s, "
+            f"{bench.delay_s:.2f} + {bench.lag_s:.2f} s, laser {bench.laser_um:.1f} µm, {bench.rate_hz:g} Hz, "
             f"weather {weather} | {self.pid_um:.3f} | {self.laser_um:.3f} | {self.all_um:.3f} |{' worse' * worse}"
         )
 

@@ -255,7 +255,7 @@ def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, Exami
 
 
 def live_answer(live: LiveReconstructor, stack: FrameStack, truth: FloatArray) -> FloatArray | None:
-    """Error, own sigma and geometry's sigma (3, 9) of sag and terms in um, as a running hold has them."""
+    """Error, own sigma and geometry's sigma (3, 9) of sag and terms in µm, as a running hold has them."""
     found = live.full(list(stack.frames), np.arange(18.0), stack.displacement_um)
     if found.verdict == "rejected":
         return None

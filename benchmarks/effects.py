@@ -59,16 +59,16 @@ EFFECTS = (
     Effect("gamma 2.2, 4 steps", room={"gamma": 2.2}),
     Effect("blur of 3 px", room={"blur_px": 3.0}),
     Effect("blur of 8 px", room={"blur_px": 8.0}),
-    Effect("film 100 um deeper in y, no laser", room={"laser": False}, between_um=100.0),
-    Effect("film 500 um deeper in y, no laser", room={"laser": False}, between_um=500.0),
-    Effect("ripple of 0.2 um at 40 mm", ripple=(Ripple(0.2, 40.0, 30.0),)),
+    Effect("film 100 µm deeper in y, no laser", room={"laser": False}, between_um=100.0),
+    Effect("film 500 µm deeper in y, no laser", room={"laser": False}, between_um=500.0),
+    Effect("ripple of 0.2 µm at 40 mm", ripple=(Ripple(0.2, 40.0, 30.0),)),
     Effect("Poisson ratio 0.4", poisson=0.4),
     Effect("pre-strain 1e-3", prestrain=1e-3),
 )
 
 
 def answer(effect: Effect, seed: int) -> tuple[FloatArray, FloatArray, str, tuple[str, ...]] | str:
-    """Errors and sigmas (n,) in um of sag, Z4..Z11 and heights, verdict and its reasons; why, if rejected."""
+    """Errors and sigmas (n,) in µm of sag, Z4..Z11 and heights, verdict and its reasons; why, if rejected."""
     rng, room = np.random.default_rng((19, seed)), replace(STEADY, **effect.room)
     stated = stated_bench(calibrated=not effect.of_geometry)
     film = replace(typical_film(37.1, 500.0, seed, effect.prestrain, effect.poisson), ripples=effect.ripple)
@@ -113,7 +113,7 @@ def _rms(values: FloatArray) -> float:
 
 
 if __name__ == "__main__":
-    print("| effect | sag: error, sigma, um | map: error, sigma, um RMS | worst error / sigma | verdict |")
+    print("| effect | sag: error, sigma, µm | map: error, sigma, µm RMS | worst error / sigma | verdict |")
     print("|---|---|---|---|---|")
     for each in EFFECTS:
         print(row(each), flush=True)

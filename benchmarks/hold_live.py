@@ -53,7 +53,7 @@ def run() -> list[Figure]:
     return [
         at_most("true centre, standard deviation", s["true_std_um"], "um", 0.15),
         at_most("true centre, |bias|", abs(s["true_bias_um"]), "um", 0.1),
-        at_least("1 s means within +-2 um", s["in_band_1s_fraction"], "", 1.0),
+        at_least("1 s means within +-2 µm", s["in_band_1s_fraction"], "", 1.0),
         at_most("tick lateness p99, metrology busy", late["p99"], "ms", 5.0, "bare asyncio loop", bare_p99_ms),
         at_most("ticks lost", s["missed_ticks"], "", 0, "ticks", s["ticks"]),
         at_most("standby to hold", entered_s["hold"] - entered_s["check"], "s", 15.0),

@@ -124,7 +124,7 @@ def lost_reading(sensors: str, seeds: Sequence[int], seconds: float = 10.0) -> d
 
 
 def start_up(seeds: Sequence[int]) -> dict[str, float]:
-    """From 25 um off: time until the true centre stays within 2 um, and the overshoot."""
+    """From 25 µm off: time until the true centre stays within 2 µm, and the overshoot."""
     times_s, over_um = [], []
     for seed in seeds:
         held = hold(*_configs("barometer and thermometer", "typical", seed, start_error_um=-25.0), 40.0)
@@ -153,7 +153,7 @@ def run(seeds: int = 4, duration_s: float = 300.0) -> dict[str, Any]:
 
 def _print(figures: dict[str, Any]) -> None:
     head = (
-        "| {} | std um | worst | least possible | bias um | worst | 1 s means in band |" + "\n|---" + "|---" * 6 + "|"
+        "| {} | std µm | worst | least possible | bias µm | worst | 1 s means in band |" + "\n|---" + "|---" * 6 + "|"
     )
     row = (
         "| {} | {std_um:.3f} | {worst_std_um:.3f} | {least_std_um:.3f} "
@@ -163,14 +163,14 @@ def _print(figures: dict[str, Any]) -> None:
     for scenario, cases in figures["steady"].items():
         for sensors, case in cases.items():
             print(row.format(f"{scenario}, {sensors}", **case))
-    print("\n" + head.format("leak um/s (warned)"))
+    print("\n" + head.format("leak µm/s (warned)"))
     for leak, case in figures["tight"].items():
         print(row.format(f"{leak} ({case['too_tight_fraction']:.0%})", **case))
     print("\n| event | " + " | ".join(SENSORS) + " |\n|---" + "|---" * len(SENSORS) + "|")
     for event in ("leak doubled", "door +20 Pa", "door -20 Pa", "10 s without a reading"):
         cells = (", ".join(f"{k} {v:.2f}" for k, v in case.items()) for case in figures[event].values())
         print(f"| {event} | " + " | ".join(cells) + " |")
-    print("\nstart from -25 um: " + ", ".join(f"{k} {v:.2f}" for k, v in figures["start"].items()))
+    print("\nstart from -25 µm: " + ", ".join(f"{k} {v:.2f}" for k, v in figures["start"].items()))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The laser's mount drifts 2 um/min for ten minutes: with the shape loop on rendered full-size frames, and without.
+"""The laser's mount drifts 2 µm/min for ten minutes: with the shape loop on rendered full-size frames, and without.
 
 Virtual time: the same controller, the same camera frames, the same reconstruction, without waiting.
 """

@@ -85,7 +85,7 @@ def _rms_um(live: LiveReconstructor, coeffs_um: np.ndarray, hencky_um: float, di
 
 
 def _reference(live: LiveReconstructor, frames: list[np.ndarray]) -> tuple[float, float]:
-    """Seconds of the paper's method on the same 8 frames, and its error in um.
+    """Seconds of the paper's method on the same 8 frames, and its error in µm.
 
     Fringe orders are those of the known film: the paper takes them from its Gray codes, whose time is left out.
     """

@@ -66,7 +66,7 @@ def _measure(stack: FrameStack, optics: OpticsConfig) -> FullResult:
 
 
 def _errors(result: FullResult) -> tuple[float, float]:
-    """RMS error in um of the fit and of the zonal map against the film itself."""
+    """RMS error in µm of the fit and of the zonal map against the film itself."""
     x, y = np.meshgrid(result.grid.axis_mm, result.grid.axis_mm)
     seen = np.isfinite(result.residual_mm)
     truth = FILM.height_mm(x[seen], y[seen])

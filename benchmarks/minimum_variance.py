@@ -34,7 +34,7 @@ def _discrete(drift: Matrix, diffusion: Matrix, step_s: float) -> tuple[Matrix, 
 def least_std_um(
     loop: LoopConfig, twin: TwinConfig, laser: bool = True, optics_um_per_root_hz: float = math.inf
 ) -> float:
-    """Bound in um for the loop's rate and sensors in the twin's scenario.
+    """Bound in µm for the loop's rate and sensors in the twin's scenario.
 
     `optics_um_per_root_hz`: noise of the measured sag times the root of the interval of frames; they count as prompt.
     """

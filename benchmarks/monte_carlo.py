@@ -29,7 +29,7 @@ from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
 
 OPTICS = OpticsConfig()
 MEASURED, PAPERS_SETS, TRIALS = 5, 451, 100  # sets measured here, sets and trials of the paper
-SLOW_UM_PER_S = 0.3  # the film's drift: 1.2 um from set to set
+SLOW_UM_PER_S = 0.3  # the film's drift: 1.2 µm from set to set
 GRID = HeightMap.over(OPTICS.mirror.analysis_radius_mm, OPTICS.mirror.radius_mm)
 
 

@@ -45,7 +45,7 @@ DOOR, LEAK, GLITCH, LOST, LATE, JUMP = (
 
 @dataclass(frozen=True, slots=True)
 class Planted:
-    """An event put into a night: `size` in Pa, per cent, um, s, ms or um of figure."""
+    """An event put into a night: `size` in Pa, per cent, µm, s, ms or µm of figure."""
 
     kind: str
     time_s: float

@@ -57,13 +57,13 @@ class DrawnPump:
     def named(self) -> str:
         """The pump in a few words."""
         return (
-            f"{self.seed}: {self.shape}, {self.full_um_per_s:.1f} against {self.leak_um_per_s:.1f} um/s, "
+            f"{self.seed}: {self.shape}, {self.full_um_per_s:.1f} against {self.leak_um_per_s:.1f} µm/s, "
             f"{self.delay_s:.2f} + {self.lag_s:.2f} s, laser {self.laser_um:.1f} um{', gusty' if self.gusts else ''}"
         )
 
 
 def drawn(seed: int) -> DrawnPump:
-    """Any shape, full flow 1.2 to 20 times a leak of 0.5 to 3 um/s, delay and lag together 0.15 to 2 s."""
+    """Any shape, full flow 1.2 to 20 times a leak of 0.5 to 3 µm/s, delay and lag together 0.15 to 2 s."""
     rng = np.random.default_rng([20261123, seed])
 
     def log(low: float, high: float) -> float:
@@ -167,7 +167,7 @@ def table(rows: Sequence[SurveyedPump]) -> str:
         "| worst error over the curve, of the full flow: median, largest | "
         f"{np.median(off):.1f} %, {off.max():.1f} %: {beyond} beyond its limit (3 %, gusty 5 %) |",
         f"| levels within two standard errors | {np.mean(levels <= 2):.0%} of {levels.size} |",
-        f"| furthest excursion: median, largest (limit 10 um) | {np.median(far):.1f}, {far.max():.1f} um |",
+        f"| furthest excursion: median, largest (limit 10 µm) | {np.median(far):.1f}, {far.max():.1f} µm |",
         "| experiments; with the holds | {:.0f} min; {:.0f} min in the median |".format(*np.median(minutes, axis=0)),
         "",
         "| pump | worst error | furthest | refused |",
@@ -176,7 +176,7 @@ def table(rows: Sequence[SurveyedPump]) -> str:
     for row in rows:
         if row.refused or row.off_share > row.most or row.excursion_um > 10.0:
             share = "" if row.refused else f"{100 * row.off_share:.1f} %"
-            lines.append(f"| {row.drawn.named} | {share} | {row.excursion_um:.1f} um | {row.refused} |")
+            lines.append(f"| {row.drawn.named} | {share} | {row.excursion_um:.1f} µm | {row.refused} |")
     return "\n".join(lines)
 
 
@@ -199,7 +199,7 @@ def main() -> None:
         rows.append(surveyed(replace(drawn(seed), **alike), given.limit_um))
         row = rows[-1]
         print(
-            f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest {row.excursion_um:.1f} um, "
+            f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest {row.excursion_um:.1f} µm, "
             f"{row.experiments_s / 60:.0f} of {row.whole_s / 60:.0f} min {row.refused}", flush=True,
         )  # fmt: skip
     print(table(rows))

@@ -110,10 +110,10 @@ def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape:
 
 
 def run(duration_s: float = 600.0) -> dict[str, dict[str, float]]:
-    """Movement of the true sag over the run (10 s means) with the laser drifting 2 um/min, and the trim's noise."""
+    """Movement of the true sag over the run (10 s means) with the laser drifting 2 µm/min, and the trim's noise."""
     figures = {}
     drifting = TwinConfig(laser_drift_um_per_min=2.0, start_error_um=0.0)
-    for name, noise_um, enabled in (("on, 0.1 um", 0.1, True), ("on, 0.3 um", 0.3, True), ("off", 0.1, False)):
+    for name, noise_um, enabled in (("on, 0.1 µm", 0.1, True), ("on, 0.3 µm", 0.3, True), ("off", 0.1, False)):
         shape = SHAPE.model_copy(update={"enabled": enabled})
         run_ = track(drifting, duration_s, noise_um, shape)
         means_um = run_.true_um[run_.time_s >= ON_S].reshape(-1, round(10 * LOOP.rate_hz)).mean(axis=1)

@@ -199,8 +199,8 @@ def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure
         at_least("held", 100 * tally.held_s / (days * DAY_S), "% of the time", 98.0),
         at_most("faults, latched or cleared", tally.events["fault"], ""),
         at_most("standard deviation of the true centre", (tally.square_um2 / tally.ticks) ** 0.5, "um"),
-        at_least("1 s means within 2 um", 100 * tally.second.fraction, "%", 99.9),
-        at_least("60 s means within 0.5 um", 100 * tally.minute.fraction, "%", 99.0),
+        at_least("1 s means within 2 µm", 100 * tally.second.fraction, "%", 99.9),
+        at_least("60 s means within 0.5 µm", 100 * tally.minute.fraction, "%", 99.0),
         at_most("growth of memory since the first hour", grown, "%", 5.0, "MB after it", tally.rss_after_hour_mb),
         at_most("events", tally.event_bytes / days / 1e3, "kB a day"),
     ]
@@ -216,7 +216,7 @@ def run() -> list[Figure]:
     day = soak(1.0, 1, faults=False)
     excursions_um = dropout_excursions_um()
     return [
-        at_least("24 h typical: 1 s means within 2 um", 100 * day.second.fraction, "%", 99.9),
+        at_least("24 h typical: 1 s means within 2 µm", 100 * day.second.fraction, "%", 99.9),
         at_most("24 h typical: worst 60 s mean", day.minute.worst_um, "um", MINUTE_BAND_UM),
         at_most("24 h typical: standard deviation", (day.square_um2 / day.ticks) ** 0.5, "um"),
         at_most("10 s without laser, worst of 12 seeds: excursion of the true centre", max(excursions_um), "um", 4.0),

@@ -2,7 +2,7 @@
 
 The number of a bench gives its geometry, film, camera, pattern, disturbances and timing. The pictures are those of a
 world that shares no code with the product (`tests/support/crossed_world.py`). A figure is silently wrong if it is
-called ok and off by more than 5 sigma and 0.1 um. A bench whose reference `measure` rejects, or whose fringes `track`
+called ok and off by more than 5 sigma and 0.1 µm. A bench whose reference `measure` rejects, or whose fringes `track`
 refuses, does not count. Answers go to a file, line by line: a run that is stopped goes on where it was.
 
 python -m benchmarks.tracking_benches [--benches N] [--first K]
@@ -202,7 +202,7 @@ def _report(one: dict[str, Any]) -> str:
     if "sag" not in one:
         return f"{one['number']:4d} {one['counts']} {one.get('verdicts', '')} {one.get('said', '')[-200:].strip()}"
     missed = [f"{f['fault']}: {f['said'][:40]}" for f in one["planted"] if not (f["named"] and f["right"])]
-    sag, terms = (f"{name} {one[name]:.2f} ({one[name + '_um']:.4f} um)" for name in ("sag", "terms"))
+    sag, terms = (f"{name} {one[name]:.2f} ({one[name + '_um']:.4f} µm)" for name in ("sag", "terms"))
     wrong = f"silently wrong {len(one['silent'])}, not ok {one['false']}, missed {missed}"
     return f"{one['number']:4d} {one['verdicts']} {sag}, {terms}, {one['largest']:.1f} at Z{one['worst']}, {wrong}"
 

@@ -36,7 +36,7 @@ def run() -> list[Figure]:
     figures.append(at_most("clean screen: figure of a frame", 1e3 * _figure_um(clean), "nm", 15.0))
     figures.append(at_most("clean screen: sag of a frame", 1e3 * rms(clean.sag_um), "nm"))
     grown = _errors({"kelvin": KELVIN}, 300.0)  # a quarter of its swing: from none to all
-    return [*figures, at_most("stand that grows by 60 um/K: sag", float(grown.sag_um[-20:].mean()) / KELVIN, "um/K")]
+    return [*figures, at_most("stand that grows by 60 µm/K: sag", float(grown.sag_um[-20:].mean()) / KELVIN, "um/K")]
 
 
 def _errors(effects: dict[str, float], lasts_s: float) -> TrackedErrors:

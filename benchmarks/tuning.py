@@ -26,7 +26,7 @@ from tuning.rig import Rig
 SETTLE_S = 40.0
 OBSERVE_S = 600.0
 VERIFY_S = 600.0
-# the vent opening that equals the leak, 1.24 um/s at 100 um/s fully open
+# the vent opening that equals the leak, 1.24 µm/s at 100 µm/s fully open
 BLEED_FRACTION = 0.0124
 
 
@@ -168,12 +168,12 @@ def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float
 
 
 SESSIONS = {
-    "quiet, 1 um": Case("quiet"),
-    "typical, 1 um": Case(),
-    "gusty, 1 um": Case("gusty"),
-    "quiet, 0.3 um": Case("quiet", 0.3),
-    "typical, 0.3 um": Case(laser_noise_um=0.3),
-    "typical, 1 um, barometer, thermometer, bleed doubled": Case(feedforward=True, bleed=1.0),
+    "quiet, 1 µm": Case("quiet"),
+    "typical, 1 µm": Case(),
+    "gusty, 1 µm": Case("gusty"),
+    "quiet, 0.3 µm": Case("quiet", 0.3),
+    "typical, 0.3 µm": Case(laser_noise_um=0.3),
+    "typical, 1 µm, barometer, thermometer, bleed doubled": Case(feedforward=True, bleed=1.0),
 }
 PLANTS = {
     "leak x 3": Case(leak=3.0),
@@ -201,7 +201,7 @@ def run(seeds: int = 16, judge_s: float = VERIFY_S) -> dict[str, Any]:
     return {
         "cases": {name: asdict(case) for name, case in (SESSIONS | PLANTS).items()},
         "sessions": {
-            name: summary(session(case, seed, name == "typical, 1 um", judge_s) for seed in chosen)
+            name: summary(session(case, seed, name == "typical, 1 µm", judge_s) for seed in chosen)
             for name, case in SESSIONS.items()
         },
         "plants": {name: summary(identified(case, seed) for seed in chosen) for name, case in PLANTS.items()},
@@ -211,7 +211,7 @@ def run(seeds: int = 16, judge_s: float = VERIFY_S) -> dict[str, Any]:
 def _print(figures: dict[str, Any]) -> None:
     print(
         "| bench | k error: mean, worst | 2 sigma | dead time error s: mean, worst | 2 sigma "
-        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion um, worst | minutes |\n|---"
+        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion µm, worst | minutes |\n|---"
         + "|---" * 8
         + "|"
     )
@@ -225,8 +225,8 @@ def _print(figures: dict[str, Any]) -> None:
             f"| {case['duration_s']['mean'] / 60:.1f} |"
         )
     print(
-        "\n| bench | least um | achieved um | / least: mean, worst | predicted / achieved: min, max "
-        "| bias um, worst | K 1/s | Ti s | filter s | Ms |\n|---" + "|---" * 9 + "|"
+        "\n| bench | least µm | achieved µm | / least: mean, worst | predicted / achieved: min, max "
+        "| bias µm, worst | K 1/s | Ti s | filter s | Ms |\n|---" + "|---" * 9 + "|"
     )
     for name, case in figures["sessions"].items():
         ratio, said = case["ours_ratio"], case["predicted_over_achieved"]
@@ -236,8 +236,8 @@ def _print(figures: dict[str, Any]) -> None:
             f"| {_worst(case['ours_bias_um']):.3f} | {case['kp_per_s']['mean']:.2f} | {case['ti_s']['mean']:.1f} "
             f"| {case['filter_s']['mean']:.2f} | {case['ms']['mean']:.2f} |"
         )
-    print("\n| typical, 1 um, laser only | std um: mean, worst | / least | bias um, worst |\n|---|---|---|---|")
-    case = figures["sessions"]["typical, 1 um"]
+    print("\n| typical, 1 µm, laser only | std µm: mean, worst | / least | bias µm, worst |\n|---|---|---|---|")
+    case = figures["sessions"]["typical, 1 µm"]
     for key in ("ours", "default", "simc", "amigo", "zn"):
         std = case[f"{key}_um"]
         print(

@@ -98,7 +98,7 @@ class BenchReading:
     displacement_quality: int
     gauge_pressure_pa: float = field(metadata=_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True))
     ambient_pressure_pa: float = field(metadata=_sensor("barometer", "ambient_pressure_pa", "Pa"))
-    air_temperature_c: float = field(metadata=_sensor("thermometer", "air_temperature_c", "degC"))
+    air_temperature_c: float = field(metadata=_sensor("thermometer", "air_temperature_c", "°C"))
     gas_temperature_c: float
     pump_fraction: float
     vent_fraction: float
@@ -133,7 +133,7 @@ SENSORS: dict[str, Role] = {each.name: each.metadata[_ROLE] for each in fields(B
 ROLES: dict[str, Role] = {
     role.name: role
     for role in (
-        Role("displacement", "displacement", "um", needed=True),
+        Role("displacement", "displacement", "µm", needed=True),
         Role("pump", "pump_fraction", "of full scale", needed=True),
         *(role for role in SENSORS.values() if role.needed),
         Role("vent", "vent_fraction", "of full scale"),

@@ -195,7 +195,7 @@ class ModbusMapConfig(Section):
     raw: tuple[Number, Number] | None = None
     """Register contents at the two ends of `value`. Set it from the manual, e.g. the counts at 4 and 20 mA."""
     value: tuple[Number, Number]
-    """Two values in the role's unit (um, Pa, degC, fraction), at the contents `raw`. Set it as scaled."""
+    """Two values in the role's unit (µm, Pa, degC, fraction), at the contents `raw`. Set it as scaled."""
     limits: tuple[Number, Number] | None = None
     """Values outside are refused; the span of `value` when absent. Set it wider for a sensor that exceeds it."""
     identity_address: Word | None = None

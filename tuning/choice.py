@@ -285,7 +285,7 @@ def compared(a: SessionFolder, b: SessionFolder) -> str:
 
 
 def _plants(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]) -> list[str]:
-    head = "| plant | k | +- | dead time s | lag s | delay +- s | leak um/s | laser um | least std um |"
+    head = "| plant | k | +- | dead time s | lag s | delay +- s | leak µm/s | laser µm | least std µm |"
     lines = [head, "|---" + "|---:" * 8 + "|"]
     for each, gains in zip((a, b), files, strict=True):
         plant = gains.plant
@@ -306,7 +306,7 @@ def _gains(files: list[gains_file.GainsFile]) -> list[str]:
 
 
 def _crossed(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]) -> list[str]:
-    head = "| gains of | on plant and weather of | std um | / least | Ms | load peak um |"
+    head = "| gains of | on plant and weather of | std µm | / least | Ms | load peak µm |"
     lines = [head, "|---|---" + "|---:" * 4 + "|"]
     for place, each in (("A", a), ("B", b)):
         found, weather = session.found_of(each), session.disturbance_of(each)

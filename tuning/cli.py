@@ -30,7 +30,7 @@ NameOption = Annotated[str, typer.Option("--name", help="Name of a new session."
 AuthorOption = Annotated[str | None, typer.Option("--author", help="Who is tuning; your login by default.")]
 ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, for the gains file and the journal.")]
 LimitOption = Annotated[
-    float, typer.Option(min=3, max=30, help="Largest excursion of the centre in an experiment, um.")
+    float, typer.Option(min=3, max=30, help="Largest excursion of the centre in an experiment, µm.")
 ]
 ObserveOption = Annotated[str, typer.Option(help="Duration of the quiet hold, 5m to 15m.")]
 VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")]

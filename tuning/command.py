@@ -104,12 +104,12 @@ def _map_pump(folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Pr
     mapped, folder = pump_trial.map_pump(folder, rig, limit_um)
     found, pump = mapped.found, mapped.found.pump
     progress.say(
-        f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} um/s at "
-        f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} um/s at {pump.curve_fraction[-1]:.3f}, "
-        f"known to {max(found.sigma_um_per_s[1:]):.2f} um/s{'' if found.known else ' (the time is over)'}; "
+        f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} µm/s at "
+        f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} µm/s at {pump.curve_fraction[-1]:.3f}, "
+        f"known to {max(found.sigma_um_per_s[1:]):.2f} µm/s{'' if found.known else ' (the time is over)'}; "
         f"starts at {pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
         f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after {found.delay_s:.2f} s "
-        f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} um/s"
+        f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} µm/s"
     )
     progress.say(
         f"pump: steps of the flow on this curve give k {mapped.gain:.2f} +- {mapped.gain_sigma:.2f}; curve and gains "
@@ -140,9 +140,9 @@ def outer(options: TuneOptions) -> int:
             raise RejectedError(f"shape loop: {error}") from None
         plain.write(folder.file("outer.json"), found)
         progress.say(
-            f"optical sag per um of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} um per cycle of "
+            f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} µm per cycle of "
             f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
-            f"{found.drift_um_per_sqrt_h:.2f} um/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
+            f"{found.drift_um_per_sqrt_h:.2f} µm/sqrt(h): shape.time_constant_s = {found.time_constant_s:.0f}"
         )
         if not _to_be_tried(shape_loop.unfit(found), found.time_constant_s, before_s, options, progress):
             return _concluded(folder, options)
@@ -157,8 +157,8 @@ def outer(options: TuneOptions) -> int:
         progress.say(
             f"taken back: {done.reason}"
             if done.reason
-            else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} um (before "
-            f"{done.error_before_um:.2f} um); `membrane-ctrl tune save --config FILE` saves it for the next one"
+            else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} µm (before "
+            f"{done.error_before_um:.2f} µm); `membrane-ctrl tune save --config FILE` saves it for the next one"
         )
     code = _concluded(folder, options)
     return Exit.REJECTED if done.reason else code
@@ -202,8 +202,8 @@ def watch(options: TuneOptions) -> int:
     if options.json:
         print(json.dumps(plain.plain(found)))
     progress.say(
-        f"std {found.std_um:.3f} um, {found.ratio:.2f} of the lower bound ({found.ratio_designed:.2f} expected); "
-        f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} um/s"
+        f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound ({found.ratio_designed:.2f} expected); "
+        f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} µm/s"
     )
     for suggestion in found.suggestions:
         progress.say(f"a tuning session is due: {suggestion}")
@@ -239,7 +239,7 @@ def _do(step: str, folder: SessionFolder, rig: HoldRig | None, options: TuneOpti
 
     def told(stage: Stage) -> None:
         progress.say(
-            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} um, {stage.growth:.2f} of the previous gains"
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} µm, {stage.growth:.2f} of the previous gains"
         )
 
     moving: dict[str, Callable[[HoldRig], object]] = {
@@ -291,13 +291,13 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
             return (
                 f"k {model.gain:.3f} +- {sigma.gain:.3f}, delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
                 f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
-                f"leak {model.leak_um_per_s:.2f} um/s: {found.quality.verdict}{reasons}{tight}"
+                f"leak {model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}{tight}"
             )
         case "observe":
             weather = session.disturbance_of(folder)
             what = "figure" if folder.config.by_optics else "laser"
             return (
-                f"{what} noise {weather.laser_um:.2f} um per reading; in weather like this the std of ten minutes "
+                f"{what} noise {weather.laser_um:.2f} µm per reading; in weather like this the std of ten minutes "
                 f"scatters by {weather.unsteady:.0%}"
             )
         case "design":
@@ -314,7 +314,7 @@ def _in_a_line(step: str, folder: SessionFolder) -> str:
                 )
                 for name, digits in (("std_um", 3), ("load_peak_um", 2), ("recovery_s", 1))
             )
-            return f"on the fitted twin std {std} um, load peak {peak} um, recovery {recovery} s"
+            return f"on the fitted twin std {std} µm, load peak {peak} µm, recovery {recovery} s"
         case "apply":
             loop = gains_file.load_gains(folder.file("gains.toml")).loop
             return f"{session.traded(folder).candidate} is on trial: {_gains_words(loop)}"

@@ -122,13 +122,13 @@ class Traded:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Standard deviation in um, load peak in um, recovery in s, Ms: each before and after."""
+        """Standard deviation in µm, load peak in µm, recovery in s, Ms: each before and after."""
         pairs = zip(astuple(self.before), astuple(self.after), (3, 2, 1, 2), strict=True)
         return tuple(f"{before:.{digits}f} -> {after:.{digits}f}" for before, after, digits in pairs)
 
     def __str__(self) -> str:
         std, peak, recovery, ms = self.words
-        return f"std {std} um, load peak {peak} um, recovery {recovery} s, Ms {ms}"
+        return f"std {std} µm, load peak {peak} µm, recovery {recovery} s, Ms {ms}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +219,7 @@ def _in_force(logs: Path) -> Iterator[GainsEntry]:
 def history_table(found: list[GainsEntry]) -> str:
     """The journal as a Markdown table."""
     lines = [
-        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std um | load peak um | recovery s "
+        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | load peak µm | recovery s "
         "| Ms | reason |",
         "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
     ]

@@ -21,7 +21,7 @@ _MAP_S = 3600.0
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
 _SLOW, _SLOWER = 0.5, 0.25  # K times how late the actuator is; SIMC with that as time constant has 0.5
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
-# Leaks that a curve must reach: with 1.5, neither known well yet, gusts let the mirror sink by 21 um
+# Leaks that a curve must reach: with 1.5, neither known well yet, gusts let the mirror sink by 21 µm
 _LIFTS = 2.0
 _AT_ONCE_S = 1.5  # a round that begins at its limit is over
 _BEFORE_S = 20.0  # whose mean flow about holds the mirror
@@ -83,7 +83,7 @@ def _calmed(rig: HoldRig, limit_um: float) -> None:
     """Cautious gains from the mean flow, with which an experiment gives the mirror back.
 
     Without a bump they would begin at the flow of a moment: of a loop that swings on an actuator that takes seconds,
-    up to twice the leak, and they are too slow to take that back before the mirror is 20 um high.
+    up to twice the leak, and they are too slow to take that back before the mirror is 20 µm high.
     """
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)

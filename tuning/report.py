@@ -33,16 +33,16 @@ def draw_experiments(path: Path, record: Record, found: identify.Identified | No
     upper, middle, lower = figure.subplots(3, 1, sharex=True)
     time_s = np.arange(len(record)) * record.dt_s
     upper.step(time_s, record.flow_um_per_s, where="post", linewidth=0.8)
-    upper.set(ylabel="flow (um/s)")
+    upper.set(ylabel="flow (µm/s)")
     middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
     if found is not None:
         middle.plot(
             time_s, loop_model.pump_share_um(record, found.model), linewidth=1, label="response to the pump (model)"
         )
         lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
-    middle.set(ylabel="centre (um)")
+    middle.set(ylabel="centre (µm)")
     middle.legend(loc="upper right")
-    lower.set(ylabel="prediction error (um)", xlabel="time (s)")
+    lower.set(ylabel="prediction error (µm)", xlabel="time (s)")
     write_figure(users(path), figure, _DPI)
 
 
@@ -76,11 +76,11 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
     (a, b, c), (d, e, f) = figure.subplots(2, 3)
     places = np.arange(len(names))
     for axes, values, title, limit in (
-        (a, stds, "predicted std (um)", design.least_std_um),
+        (a, stds, "predicted std (µm)", design.least_std_um),
         (b, [row.margins.ms for row in rows], "Ms", 1.4),
-        (c, [row.load_peak_um for row in rows], "load peak (um)", math.nan),
+        (c, [row.load_peak_um for row in rows], "load peak (µm)", math.nan),
         (d, np.minimum([row.load_recovery_s for row in rows], 60.0), "recovery (s, cut at 60)", math.nan),
-        (e, np.minimum(flows, 3.0), "flow std (um/s, cut at 3)", math.nan),
+        (e, np.minimum(flows, 3.0), "flow std (µm/s, cut at 3)", math.nan),
     ):
         axes.barh(places, values, color=["tab:green"] + ["tab:blue"] * (len(names) - 1))
         axes.set_yticks(places, names, fontsize=7)
@@ -112,7 +112,7 @@ def draw_verification(
         response = loop_model.loop_response(loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s)
         ms = float(np.max(np.abs(1 / (1 + response))))
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
-    left.set(xlabel="frequency (Hz)", ylabel="readings (um^2/Hz)")
+    left.set(xlabel="frequency (Hz)", ylabel="readings (µm^2/Hz)")
     left.legend(loc="best")
     times = [stage.time_s for stage in done.stages]
     right.plot(times, [stage.growth for stage in done.stages], "o-", label="std relative to the previous gains")
@@ -192,7 +192,7 @@ def _identified(folder: SessionFolder) -> list[str]:
         ("dead time (s)", f"{model.dead_time_s:.3f}", f"{sigma.dead_time_s:.3f}"),
         ("lag (s)", f"{model.lag_s:.3f}", f"{sigma.lag_s:.3f}"),
         ("delay, both (s)", f"{model.delay_s:.3f}", f"{sigma.delay_s:.3f}"),
-        ("leak (um/s)", f"{model.leak_um_per_s:.2f}", f"{sigma.leak_um_per_s:.2f}"),
+        ("leak (µm/s)", f"{model.leak_um_per_s:.2f}", f"{sigma.leak_um_per_s:.2f}"),
     ]
     parts.append(_table(("", "value", "1 sigma"), rows))
     parts.append(
@@ -208,7 +208,7 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} um. Every predicted std rests on this "
+        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} µm. Every predicted std rests on this "
         f"record: ten other minutes of weather like it change it by {weather.unsteady:.0%} (1 sigma), and its "
         "fit has an error.</p>",
         _image(folder, "weather.png"),
@@ -225,8 +225,8 @@ def _designed(folder: SessionFolder) -> list[str]:
         _image(folder, "candidates.png"),
         f"<p>{html.escape(traded.candidate)} is {by}: K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, "
         f"filter {gains.loop.measurement_filter_s:.2f} s. Present and new gains: {html.escape(str(traded))}. Lower "
-        f"bound of the std: {gains.least_std_um:.3f} um. The proposal over plants drawn from the fit: Ms "
-        f"{design.robustness.ms_p95:.2f}, std {design.robustness.std_p95_um:.3f} um at 95 %, "
+        f"bound of the std: {gains.least_std_um:.3f} µm. The proposal over plants drawn from the fit: Ms "
+        f"{design.robustness.ms_p95:.2f}, std {design.robustness.std_p95_um:.3f} µm at 95 %, "
         f"{design.robustness.stable_fraction:.0%} stable.</p>",
     ]
     if folder.done("preview"):
@@ -250,7 +250,7 @@ def _verified(folder: SessionFolder) -> list[str]:
         (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
         for s, ms in zip(done.stages, seen, strict=True)
     ]
-    heads = ("after", "std um", "previous um", "ratio", "observed sensitivity", "")
+    heads = ("after", "std µm", "previous µm", "ratio", "observed sensitivity", "")
     return [
         f"<h2>Verification</h2><p class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
         _table(heads, rows),
@@ -327,23 +327,23 @@ def _blueprint() -> rrb.Blueprint:
         return rrb.TimeSeriesView(name=name, origin="/", contents=[f"+ /{path}" for path in paths])
 
     experiment = rrb.Vertical(
-        plot("Flow, um/s", "experiment/flow_um_per_s"),
-        plot("Centre and its response to the pump, um", "experiment/displacement_um", "fit/pump_share_um"),
-        plot("Residual, um", "residual/prediction_error_um"),
+        plot("Flow, µm/s", "experiment/flow_um_per_s"),
+        plot("Centre and its response to the pump, µm", "experiment/displacement_um", "fit/pump_share_um"),
+        plot("Residual, µm", "residual/prediction_error_um"),
         name="Experiment and fit",
     )
     candidates = rrb.Vertical(
         rrb.TextDocumentView(name="Candidates", origin="/candidates/table"),
         rrb.Horizontal(
-            rrb.BarChartView(name="Predicted std, um", origin="/candidates/std_um"),
+            rrb.BarChartView(name="Predicted std, µm", origin="/candidates/std_um"),
             rrb.BarChartView(name="Ms", origin="/candidates/ms"),
         ),
         name="Candidates",
     )
     compared = rrb.Vertical(
-        plot("Centre before, um", "before/displacement_um"),
-        plot("Centre after, um", "after/displacement_um"),
-        plot("Flow before and after, um/s", "before/flow_um_per_s", "after/flow_um_per_s"),
+        plot("Centre before, µm", "before/displacement_um"),
+        plot("Centre after, µm", "after/displacement_um"),
+        plot("Flow before and after, µm/s", "before/flow_um_per_s", "after/flow_um_per_s"),
         name="Before and after",
     )
     panel = rrb.TimePanel(state="collapsed", timeline=_TIMELINE)

@@ -191,7 +191,7 @@ class HoldRig:
         return [self._next_held() for _ in range(round(duration_s / self.dt_s))]
 
     def hold_about(self, duration_s: float) -> tuple[Record, Series]:
-        """As `hold`, with each sample's setpoint in um, because the shape loop moves setpoint and mirror."""
+        """As `hold`, with each sample's setpoint in µm, because the shape loop moves setpoint and mirror."""
         rows = self.ticks(duration_s)
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])

@@ -74,7 +74,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
             )
         self._decimals = len(values[self._config.amplifier].partition(".")[2])
         if _STEPS_UM[self._decimals] > self._config.step_max_um:
-            raise roles.DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} um")
+            raise roles.DeviceRefusedError(f"{self._link.name}: head with steps of {_STEPS_UM[self._decimals]:g} µm")
         errors = await self._link.query(self._errors_command, self._errors_answer)
         if errors[2] != _NOT_READABLE:  # amplifiers without this number: the value shows their head error
             _refuse(self._link.name, errors[2])
@@ -83,7 +83,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
                 f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual"
             )
         await self._reading()  # the first one is confirmed by a second
-        detail = f"amplifier {self._config.amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} um"
+        detail = f"amplifier {self._config.amplifier} of {len(values)}, steps of {_STEPS_UM[self._decimals]:g} µm"
         return roles.DeviceIdentity("Keyence DL-RS1A", "", "", detail)
 
     async def displacement(self) -> roles.DisplacementSample:
@@ -94,7 +94,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         """
         quality, displacement_um, passed = await self._reading()
         if not passed:
-            raise roles.LinkError(f"{self._link.name}: jump to {displacement_um:.0f} um, ignored until it repeats")
+            raise roles.LinkError(f"{self._link.name}: jump to {displacement_um:.0f} µm, ignored until it repeats")
         self._readings += 1
         return roles.DisplacementSample(displacement_um, quality, self._readings, asyncio.get_running_loop().time())
 

@@ -6,7 +6,7 @@ before that. The answer may repeat the command and write a rate as `4`, `4.0` or
 
 The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
 of 80 values). A corrupted byte, which the protocol cannot detect, is one outlier among many and is dropped; and
-unlike the median, the mean resolves less than a digital step (0.8 um at 50 mm range).
+unlike the median, the mean resolves less than a digital step (0.8 µm at 50 mm range).
 
 In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest bits: low `00`,
 middle `01`, high `10` for the first value of a measurement and `11` for further ones. Here a measurement is distance
@@ -221,7 +221,7 @@ class Optoncdt1420:
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
             raise roles.LinkError(
-                f"{self._port.name}: a jump to {displacement_um:.1f} um is ignored until it repeats"
+                f"{self._port.name}: a jump to {displacement_um:.1f} µm is ignored until it repeats"
             )
         quality = 0 if _IN_RANGE[0] <= raw <= _IN_RANGE[1] else int(raw)
         return roles.DisplacementSample(

@@ -160,8 +160,8 @@ class ShapeCycle:
         return replace(estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle)
 
 
-# One reading has 1 um of noise, ten times the held centre's motion between frames: a frame gets the mean of the
-# readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 um), symmetric in time so that a steady motion
+# One reading has 1 µm of noise, ten times the held centre's motion between frames: a frame gets the mean of the
+# readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 µm), symmetric in time so that a steady motion
 # cancels; in these 0.4 s the held centre moves less than the remaining noise.
 HALF_WINDOW_S = 0.2
 HALF_WINDOW_TICKS = 2.0  # below 10 Hz there would be too few readings for a mean
@@ -182,7 +182,7 @@ class LaserHistory:
         self._counter = math.nan
 
     def at(self, time_s: float) -> float:
-        """Mean reading (um) within `half_window_s` of a time on the run's clock.
+        """Mean reading (µm) within `half_window_s` of a time on the run's clock.
 
         NaN with fewer than `LEAST_READINGS` good ones; missing, flagged and repeated samples do not count.
         """

@@ -64,7 +64,7 @@ class Laser(Protocol):
     """Gives the displacement at a recent time."""
 
     def at(self, time_s: float) -> float:
-        """Displacement in um, NaN if unknown."""
+        """Displacement in µm, NaN if unknown."""
 
 
 class Exposures:

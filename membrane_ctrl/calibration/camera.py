@@ -298,8 +298,8 @@ def lines_of(report: dict[str, object]) -> list[str]:
     assert isinstance(error, dict)
     return [
         f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
-        f"fringe error on the screen: {error['as_sent']:.1f} um RMS as sent, "
-        f"{error['corrected']:.1f} um corrected, from the rounding of its levels",
+        f"fringe error on the screen: {error['as_sent']:.1f} µm RMS as sent, "
+        f"{error['corrected']:.1f} µm corrected, from the rounding of its levels",
         "for the configuration (otherwise every start measures both):",
         "[devices.screen]",
         f"settle_ms = {report['settle_ms']:.0f}",

@@ -132,9 +132,9 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
 def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
-        f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} um "
-        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now {held.setpoint_um:g} um, "
-        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} um/s), then back to {head.start_um:g} um: "
+        f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
+        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now {held.setpoint_um:g} µm, "
+        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} µm/s), then back to {head.start_um:g} µm: "
         f"about {minutes:.0f} min"
     )
 
@@ -142,7 +142,7 @@ def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minute
 def _worth(link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, options: LiveOptions) -> str:
     """How well the sets will determine the geometry, and how much better a wider range would."""
     here = _foreseen(link, held, head.setpoints_um, options)
-    line = f"a figure after these sets: sag +- {here.sag_um:.1f} um, figure +- {here.figure_rms_um:.1f} um RMS"
+    line = f"a figure after these sets: sag +- {here.sag_um:.1f} µm, figure +- {here.figure_rms_um:.1f} µm RMS"
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
@@ -150,7 +150,7 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, 
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
     reach = sessions.reach_of(held, link.config)
     return (
-        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} um of range would give {best.sag_um:.1f} and "
+        f"{line}; {verdict.GOOD_SPREAD_UM:.0f} µm of range would give {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
         f"{reach.high_um - reach.low_um:.0f})"
     )

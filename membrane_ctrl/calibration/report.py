@@ -109,7 +109,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} {row['sigma_before']:<8.4g} {says}"
         )
-    lines.append("set                 reading um   sag mm    noise  residual um  against the others")
+    lines.append("set                 reading µm   sag mm    noise  residual µm  against the others")
     for row in report["sets"]:
         reading = "-" if row["displacement_um"] is None else f"{row['displacement_um']:.1f}"
         reading = reading if row["surface"] == "film" else row["surface"]
@@ -119,24 +119,24 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         )
     claim = report["uncertainty"]
     lines.append(
-        f"figure with this geometry: sag +- {claim['sag_um']:.2f} um, figure +- {claim['figure_rms_um']:.2f} um RMS, "
-        f"with its tilt +- {claim['height_rms_um']:.1f} um RMS"
+        f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- {claim['figure_rms_um']:.2f} µm RMS, "
+        f"with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
     )
     if (number := report["advice"]) is not None:
         unit = parameters.ALL[parameters.NAMES.index(number["name"])].unit
         known = f"{number['sigma']:.2g} {unit}".strip()
-        lines.append(f"best next: {number['name']} known to {known} would give sag +- {number['sag_um']:.2g} um")
+        lines.append(f"best next: {number['name']} known to {known} would give sag +- {number['sag_um']:.2g} µm")
     if (sphere := report["artefact_advice"]) is not None:
         together = " and ".join(sphere["together"][:2])
         lines.append(
             (f"not told apart here: {together}; put" if together else "better: put")
             + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
             f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
-            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} um"
+            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} µm"
         )
     for where, each in zip(("with the screen alone", "and then"), report["screen_advice"], strict=False):
         do = _SCREENS[each["sets"]].format(abs(each["distance_mm"]), _SCREEN_KNOWN[each["sets"]])
-        lines.append(f"{where}: {do}: sag +- {each['sag_um']:.2g} um")
+        lines.append(f"{where}: {do}: sag +- {each['sag_um']:.2g} µm")
     if report["laser"]["sigma"] < _SOME_LASER:
         lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
@@ -175,7 +175,7 @@ def draw_residuals(path: Path, solution: solve.Solution) -> None:
             panel.set_title(f"{phases.name}: {name}", fontsize=8, parse_math=False)
             panel.tick_params(labelsize=6)
     panels[0][0].invert_yaxis()  # rows count downwards; the axes are shared
-    figure.colorbar(colours, ax=panels, label="seen minus predicted, um on the screen")
+    figure.colorbar(colours, ax=panels, label="seen minus predicted, µm on the screen")
     write_figure(users(path), figure, _DPI)
 
 

@@ -202,7 +202,7 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
         Number of sets.
     """
     room_um = reach.high_um - reach.low_um
-    allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} um"
+    allowed = f"{reach.low_why} and {reach.high_why} leave {max(room_um, 0.0):.0f} µm"
     if range_um is not None and range_um > room_um:
         raise errors.InputError(
             f"--range-um {range_um:g}: {allowed}; reduce it, or widen the limits if the film allows"
@@ -211,8 +211,8 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
     if wide_um < LEAST_SPREAD_UM:
         what = allowed if range_um is None else f"--range-um {range_um:g}"
         raise errors.InputError(
-            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} um add nothing to one set; "
-            f"{GOOD_SPREAD_UM:.0f} um is good"
+            f"{what}: sets closer together than {LEAST_SPREAD_UM:.0f} µm add nothing to one set; "
+            f"{GOOD_SPREAD_UM:.0f} µm is good"
         )
     low_um = min(max(held.setpoint_um - wide_um / 2, reach.low_um), reach.high_um - wide_um)
     ascending = [float(each) for each in np.round(np.linspace(low_um, low_um + wide_um, sets), 1)]

@@ -218,7 +218,7 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     apart = ""
     if reference_um is None and len(named) > 1:
         apart = (
-            f"the sets state reference_displacement_um from {named[0]:.0f} to {named[-1]:.0f} um; the first set's is "
+            f"the sets state reference_displacement_um from {named[0]:.0f} to {named[-1]:.0f} µm; the first set's is "
             "used: if the geometry was measured anew for each set, they are not of one bench"
         )
     reference_um = _reference_um([sets[k] for k in films], [benches[k] for k in films], reference_um)
@@ -262,7 +262,7 @@ def join(
     if not any(apart <= _SAME_FILM_UM for apart in apart_um):
         raise errors.InputError(
             f"{folder / 'capture.toml'}: screen_moved: needs a set of the film with the screen in its place, "
-            f"the laser's readings within {_SAME_FILM_UM:.0f} um"
+            f"the laser's readings within {_SAME_FILM_UM:.0f} µm"
         )
     k = films[int(np.nanargmin(apart_um))]
     base, deeper_um = sets[k], phases.displacement_um - sets[k].displacement_um
@@ -318,7 +318,7 @@ def known_sigmas(optics: OpticsConfig, free: Mapping[str, float]) -> dict[str, f
     """How well poses, lens, screen and laser are known: as freed, else as stated, else by rulers and data sheets.
 
     Nothing is exact: a stated 0 counts as unstated. A focal length that is held and off by 0.1 % puts the sag off by
-    34 um, which the residuals hardly show.
+    34 µm, which the residuals hardly show.
     """
     stated = optics.geometry
     given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}

@@ -94,7 +94,7 @@ class Sweep:
             for row in self._news().rows:
                 obeyed = obeyed or row.target_um == setpoint_um
                 if obeyed and row.target_um != setpoint_um:
-                    raise HoldError(f"someone else moved the setpoint to {row.target_um:g} um")
+                    raise HoldError(f"someone else moved the setpoint to {row.target_um:g} µm")
                 begin_s = row.mono_s if math.isnan(begin_s) else begin_s
                 ramping = abs(row.setpoint_um - row.trim_um - setpoint_um) > _ARRIVED_UM
                 if not obeyed or ramping:
@@ -105,7 +105,7 @@ class Sweep:
                 return
             if self._last_s - begin_s > patience_s:
                 raise errors.DeviceError(
-                    f"the mirror does not settle at {setpoint_um:g} um in {patience_s:.0f} s; paused, or too tight?"
+                    f"the mirror does not settle at {setpoint_um:g} µm in {patience_s:.0f} s; paused, or too tight?"
                 )
 
     def take(self) -> run_events.Capture:
@@ -187,12 +187,12 @@ class Procedure:
         reach = reach_of(held, config)
         if low_um < reach.low_um or high_um > reach.high_um:
             raise errors.InputError(
-                f"the sets from {low_um:g} to {high_um:g} um are beyond {reach.low_um:.0f} to {reach.high_um:.0f}, "
+                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} to {reach.high_um:.0f}, "
                 f"which {reach.low_why} and {reach.high_why} allow"
             )
         if way_s(held, low_um, high_um, config) + way_s(held, high_um, low_um, config) == float("inf"):
             raise errors.InputError(
-                f"the mirror loses {held.leak_um_per_s:.2f} um/s: it cannot be moved both ways; "
+                f"the mirror loses {held.leak_um_per_s:.2f} µm/s: it cannot be moved both ways; "
                 "open the bleed (loop.bleed_fraction), or give the pump more reserve"
             )
 
@@ -210,7 +210,7 @@ class Procedure:
 
     def _take(self, session: CalibrationSession, index: int, expected_s: float, after_s: float) -> None:
         setpoint_um = session.head.setpoints_um[index]
-        what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} um"
+        what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} µm"
         self.progress.begin(what, expected_s, after_s)
         self.sweep.go(setpoint_um, expected_s)
         event = self.sweep.take()
@@ -238,7 +238,7 @@ class Procedure:
         head = session.head
         far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
         back_s = step_s(self.held, far_um, head.start_um, self.link.config)
-        self.progress.begin(f"back to {head.start_um:g} um (Ctrl-C stops waiting)", back_s, 0.0)
+        self.progress.begin(f"back to {head.start_um:g} µm (Ctrl-C stops waiting)", back_s, 0.0)
         try:
             self.sweep.go(head.start_um, back_s)
         except KeyboardInterrupt:

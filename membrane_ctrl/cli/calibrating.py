@@ -89,7 +89,7 @@ def calibrate(
     ] = None,
     prior: PriorOption = None,
     laser_sigma_um: Annotated[
-        float, typer.Option(min=0.001, help="Standard uncertainty of a set's mean laser reading, um.")
+        float, typer.Option(min=0.001, help="Standard uncertainty of a set's mean laser reading, µm.")
     ] = 1.0,
     film: Annotated[
         FilmModel, typer.Option(help="What the film follows: nothing (free), the law with any pre-strain, or Hencky.")
@@ -101,7 +101,7 @@ def calibrate(
     json: JsonOption = False,
     live: Annotated[bool, typer.Option("--live", help="Take the sets from a hold; ask before it moves.")] = False,
     range_um: Annotated[
-        float | None, typer.Option(help="--live: range of setpoints, um; by default 8000, or less if limited.")
+        float | None, typer.Option(help="--live: range of setpoints, µm; by default 8000, or less if limited.")
     ] = None,
     sets: Annotated[int | None, typer.Option(min=2, max=20, help="--live: number of sets; 5 by default.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="--live: move the mirror and adopt without asking.")] = False,

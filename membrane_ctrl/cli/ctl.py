@@ -29,8 +29,8 @@ def _number(text: str) -> float:
         raise typer.BadParameter(str(error)) from None
 
 
-SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, um.", parser=_number)]
-FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, um/s of the centre.", parser=_number)]
+SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_number)]
+FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_number)]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]

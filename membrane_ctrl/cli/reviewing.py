@@ -146,7 +146,7 @@ def list_runs(
     since: Annotated[str | None, typer.Option(help="Only runs started on this day (UTC) or later.")] = None,
     until: Annotated[str | None, typer.Option(help="Only runs started before this day (UTC).")] = None,
     longer: Annotated[str | None, typer.Option(help="Only runs at least this long, e.g. 2h.")] = None,
-    std_um: Annotated[float | None, typer.Option(min=0, help="Largest standard deviation, um.")] = None,
+    std_um: Annotated[float | None, typer.Option(min=0, help="Largest standard deviation, µm.")] = None,
     faults: Annotated[
         bool | None, typer.Option("--faults/--no-faults", help="Only runs with or without faults.")
     ] = None,

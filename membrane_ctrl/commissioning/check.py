@@ -159,8 +159,8 @@ def _what_would_happen(config: Config) -> dict[str, str]:
     figures = f"{shape.track_rate_hz:g} figures/s, tracked" if shape.mode == "track" else cycle
     return {
         "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
-        "hold": f"{loop.setpoint_um:g} um at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
-        f"{limits.displacement_max_um:g} um and {limits.gauge_pressure_max_pa:g} Pa",
+        "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
+        f"{limits.displacement_max_um:g} µm and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
         "geometry": _geometry(config),
@@ -233,7 +233,7 @@ async def probe_board(board: PumpBoard, name: str, laser: bool = True) -> Device
 
 def _board_reading(reading: roles.BenchReading) -> str:
     return (
-        f"{reading.displacement_um:.2f} um, {reading.gauge_pressure_pa:.1f} Pa gauge, "
+        f"{reading.displacement_um:.2f} µm, {reading.gauge_pressure_pa:.1f} Pa gauge, "
         f"{reading.ambient_pressure_pa:.1f} Pa ambient, {reading.air_temperature_c:.2f} degC"
     )
 

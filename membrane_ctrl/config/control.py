@@ -49,7 +49,7 @@ class LoopConfig(Section):
     feedforward_filter_s: Annotated[float, Field(ge=0, le=60)] = 0.2
     """Filter on the weather sensors. Raise it for noisy sensors, at the cost of a later correction."""
     bleed_fraction: Fraction = 0.0
-    """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 um/s)."""
+    """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 µm/s)."""
 
     def flow_most_um_per_s(self, pump: "PumpConfig") -> float:
         """The largest flow that the loop commands: within its own limit and the pump's."""
@@ -82,7 +82,7 @@ class PumpConfig(Section):
     """Flow when a command is reached from a larger one. Set it with `tune pump` for a pump with hysteresis."""
     probe_um: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Amplitude of a sine of 5 s by which a hold moves the centre to learn the pump's drift from its curve; 0: none.
-    Set it to half the centre's standard deviation: 0.1 gives 5 % after three hours at 1 um of laser noise."""
+    Set it to half the centre's standard deviation: 0.1 gives 5 % after three hours at 1 µm of laser noise."""
     change_max: Annotated[float, Field(gt=0, le=1)] = 0.12
     """Drift of the pump from its curve that causes the notice `pump_drift`. Raise it for a pump that varies."""
     stroke_hz: Annotated[float, Field(ge=0, le=100)] = 0.0
@@ -146,13 +146,13 @@ class LimitsConfig(Section):
     """Largest jump of the gauge: a slammed door (100 Pa) moves it by 2 Pa, a storm of 250 Pa by 5 Pa.
     Raise it for a noisier gauge."""
     laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
-    """Largest contradiction of laser and gauge within minutes. 20 um are 1 Pa: 30 sigma of a gauge's ten-second mean,
-    5 times the drift in two minutes of a mount at 2 um/min. Raise it for a noisier gauge."""
+    """Largest contradiction of laser and gauge within minutes. 20 µm are 1 Pa: 30 sigma of a gauge's ten-second mean,
+    5 times the drift in two minutes of a mount at 2 µm/min. Raise it for a noisier gauge."""
     laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 120.0
-    """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to 99 um against an
+    """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to 99 µm against an
     hour before (control/film.py). Raise it for a room that changes faster."""
     laser_gauge_day_max_um: Annotated[float, Field(gt=0, le=10000)] = 700.0
-    """The same within a day: such a climate moves the film by up to 624 um. The true centre may be off by as much.
+    """The same within a day: such a climate moves the film by up to 624 µm. The true centre may be off by as much.
     Lower it for a room with a steady climate; a third of it raises the notice `slow_drift`."""
     leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
     """Factor by which the gas taken may grow unseen by a camera: a doubled leak is a leak, more may be a runaway.
@@ -184,7 +184,7 @@ class StatesConfig(Section):
     settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
     """Longest settling. Raise it for slow loops."""
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
-    """Longest hold of the mean flow without a reading. 10 s cost 1.6 um on average (docs/physics.md); longer is no
+    """Longest hold of the mean flow without a reading. 10 s cost 1.6 µm on average (docs/physics.md); longer is no
     glitch. Raise it where a longer loss is known to be harmless."""
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
     """Time in which the flow then ramps down. Leave it, except for a film that must be lowered more slowly."""
@@ -232,7 +232,7 @@ class ShapeConfig(Section):
     bin_px: Annotated[int, Field(ge=1, le=16)] = 4
     """Side of the squares of camera pixels that are averaged. Lower it for more detail at more computing."""
     time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
-    """Memory of the trim's tracker: a mount that starts to drift at 2 um/min is followed within 0.5 um
+    """Memory of the trim's tracker: a mount that starts to drift at 2 µm/min is followed within 0.5 µm
     (control/filters.py). Change it with `tune outer`; noisier frames need a longer one."""
     trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Fastest trim. Raise it for a mount that moves faster."""
@@ -290,4 +290,4 @@ class EstimatorConfig(Section):
     stand_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
     """Time constant with which the stand follows the air. Change it for a lighter or heavier stand."""
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
-    """Walk of the laser's mount: 0.2 um in an hour. Change it to your mount's."""
+    """Walk of the laser's mount: 0.2 µm in an hour. Change it to your mount's."""

@@ -43,7 +43,7 @@ class HeightMapConfig(Section):
         if len(self.heights_mm) != rows or any(len(row) != columns for row in self.heights_mm):
             shape = f"{len(self.heights_mm)} rows of {', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
             raise ValueError(f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of {columns}")
-        if max(abs(h) for row in self.heights_mm for h in row) > 100:  # no screen is that crooked: um taken for mm?
+        if max(abs(h) for row in self.heights_mm for h in row) > 100:  # no screen is that crooked: µm taken for mm?
             raise ValueError("heights_mm has a height beyond 100 mm")
         return self
 
@@ -285,7 +285,7 @@ class DisturbancesConfig(Section):
     rolling_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Time from the first to the last row of a picture; 0: a global shutter. Set it to your camera's."""
     stand_k: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Swing of the temperature of the camera's stand, which grows by 60 um/K. Raise it to see the sag follow it."""
+    """Swing of the temperature of the camera's stand, which grows by 60 µm/K. Raise it to see the sag follow it."""
     seeing_um: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Where rays meet the screen, wandering within half a second. Raise it to see warm air over the mirror."""
 

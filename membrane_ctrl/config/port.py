@@ -267,7 +267,7 @@ class AlarmRule(Section):
 
 
 _RULES = (
-    # the film's own motion is below 1 um: ten times that for half a minute is not a gust
+    # the film's own motion is below 1 µm: ten times that for half a minute is not a gust
     AlarmRule(name="out_of_band", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True),
     # a leak that takes nearly all of the pump's flow will soon take more
     AlarmRule(name="pump_near_limit", field="pump_fraction", raise_at=0.9, clear_at=0.7, for_s=120.0),

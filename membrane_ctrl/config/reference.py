@@ -27,7 +27,7 @@ _UNITS = {
     "adu": "counts", "baud": "Bd", "bits": "bits", "bytes": "bytes", "cycles": "cycles", "day": "day", "days": "days",
     "db": "dB", "deg": "deg", "fraction": "1", "gb": "GB", "h": "h", "hz": "Hz", "k": "K", "khz": "kHz", "mb": "MB",
     "m": "m", "min": "min", "mm": "mm", "ms": "ms", "mw": "mW", "n": "N", "nm": "nm", "pa": "Pa", "px": "px",
-    "s": "s", "s2": "s2", "um": "um",
+    "s": "s", "s2": "s2", "um": "µm",
 }  # fmt: skip
 
 

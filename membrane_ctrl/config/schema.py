@@ -260,7 +260,7 @@ class Config(Section):
         if not limits.displacement_min_um < self.loop.setpoint_um < limits.displacement_max_um:
             raise ValueError(
                 f"loop.setpoint_um = {self.loop.setpoint_um:g} is outside the limits "
-                f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} um)"
+                f"({limits.displacement_min_um:g} .. {limits.displacement_max_um:g} µm)"
             )
         if self.devices is not None:
             shared = device_places.find_shared(self.devices.roles(), self.devices.interlocks)

@@ -50,11 +50,11 @@ class SensorView(StateNode):
 
 @dataclass(frozen=True, slots=True)
 class CentreEstimate(StateNode):
-    """The centre in um, as the laser would read it without noise.
+    """The centre in µm, as the laser would read it without noise.
 
     Attributes
     ----------
-    um, sigma_um : float
+    µm, sigma_um : float
         Centre plus mount, and the standard deviation of the centre.
     mount_um : float
         Displacement of the laser's mount: the true centre is `um - mount_um`.
@@ -165,7 +165,7 @@ class Transit:
         self.memory.arriving = flow_um_per_s
 
     def advance(self, flow_um_per_s: float, dt_s: float) -> float:
-        """Pump at a rate for a step; returns the rise of the centre in it, um."""
+        """Pump at a rate for a step; returns the rise of the centre in it, µm."""
         memory = self.memory
         for _ in range(max(1, round(dt_s / self._period_s))):
             memory.flows.appendleft(flow_um_per_s)

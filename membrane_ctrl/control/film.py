@@ -16,20 +16,20 @@ from membrane_ctrl.control.filters import LowPass, smoothing
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
 
-# 0.5 Pa of noise per sample are then 0.7 um at 10 Hz and 2.3 um at 1 Hz
+# 0.5 Pa of noise per sample are then 0.7 µm at 10 Hz and 2.3 µm at 1 Hz
 SMOOTH_S = 10.0
-# A mean of 50 of the gauge's readings is good to 1.4 um; ten-second means of fewer are not much better when warm.
+# A mean of 50 of the gauge's readings is good to 1.4 µm; ten-second means of fewer are not much better when warm.
 _KNOWN_S, _KNOWN_READINGS, WARM_S = 5.0, 50, 3 * SMOOTH_S
-# Creep of 10 um/min is 20 um ahead of this reference; the 2 um/min of a mount that warms up are 4 um.
+# Creep of 10 µm/min is 20 µm ahead of this reference; the 2 µm/min of a mount that warms up are 4 µm.
 SINCE_MINUTES_S = 120.0
-# Climate moves the gauge against laser and optics: a day of +-10 % relative humidity by +-235 um, of +-2 K by +-41 um
-# of the gauge's zero (1 Pa/K) and +-114 um of a film that follows the air before its ring does. All of it in phase,
-# +-390 um, is 99 um ahead of a reference of an hour. A drift must be faster than 0.033 um/s to reach 120 um there.
+# Climate moves the gauge against laser and optics: a day of +-10 % relative humidity by +-235 µm, of +-2 K by +-41 µm
+# of the gauge's zero (1 Pa/K) and +-114 µm of a film that follows the air before its ring does. All of it in phase,
+# +-390 µm, is 99 µm ahead of a reference of an hour. A drift must be faster than 0.033 µm/s to reach 120 µm there.
 SINCE_HOUR_S = 3600.0
-# That climate is up to 624 um ahead of this reference (from the day's highest to its lowest); so is any drift faster
-# than 29 um/h, which therefore ends at 700 um and somewhat more.
+# That climate is up to 624 µm ahead of this reference (from the day's highest to its lowest); so is any drift faster
+# than 29 µm/h, which therefore ends at 700 µm and somewhat more.
 SINCE_DAY_S = 86_400.0
-# Of the limit within a day: the climate of a controlled laboratory (+-1 K, +-5 %, 220 um) stays below it.
+# Of the limit within a day: the climate of a controlled laboratory (+-1 K, +-5 %, 220 µm) stays below it.
 DRIFTING_SHARE = 1 / 3
 # A notice ends only when the two are clearly nearer again.
 DRIFTING_OVER_SHARE = 0.8 * DRIFTING_SHARE
@@ -47,7 +47,7 @@ TAUT_PA = 100.0
 LEAK_REFERENCE_S = 3600.0
 # As long as the averaging time of the leak.
 LEAK_STANDS_S = 60.0
-# The loop moves the flow by 0.15 um/s: of a mean over this, 0.03 um/s.
+# The loop moves the flow by 0.15 µm/s: of a mean over this, 0.03 µm/s.
 FLOW_MEAN_S = 15.0
 # Least gas taken by a mirror: a ratio to almost nothing is meaningless.
 LEAK_LEAST_UM_PER_S = 0.8
@@ -92,7 +92,7 @@ class _Since:
         apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
         memory.share = apart_um / (self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um)))
         if memory.share > 1.0:
-            return f"{self.sensor} {by_laser_um:+.0f} um, gauge {by_gauge_um:+.0f} um"
+            return f"{self.sensor} {by_laser_um:+.0f} µm, gauge {by_gauge_um:+.0f} µm"
         share = smoothing(dt_s, self.follow_s)
         memory.laser_um += share * by_laser_um
         memory.trim_um += share * trimmed_um
@@ -146,7 +146,7 @@ class LeakGrowth(StateNode):
         self.stands_s += dt_s
         if self.stands_s < LEAK_STANDS_S:
             return ""
-        return f"the film takes {takes_um_per_s:.1f} um/s of gas; it used to take {usual_um_per_s:.1f} um/s"
+        return f"the film takes {takes_um_per_s:.1f} µm/s of gas; it used to take {usual_um_per_s:.1f} µm/s"
 
 
 @dataclass(slots=True)
@@ -231,7 +231,7 @@ class FilmMonitor:
 
     @property
     def drift_um(self) -> float:
-        """How far sensor and gauge have moved apart within a day, um; 0 without a reference."""
+        """How far sensor and gauge have moved apart within a day, µm; 0 without a reference."""
         return self.memory.day.share * self._limits.laser_gauge_day_max_um
 
     @property
@@ -251,16 +251,16 @@ class FilmMonitor:
 # Laser against optics, with the gauge pressure as arbiter.
 #
 # All three see the sag of the mirror film change: the laser as d, the camera as sag, the gauge as pressure, which for
-# a Hencky film (w ~ p^(1/3)) is dw = w / (3 p) dp. The gauge is too noisy to hold a mirror with (0.5 Pa are 10 um),
+# a Hencky film (w ~ p^(1/3)) is dw = w / (3 p) dp. The gauge is too noisy to hold a mirror with (0.5 Pa are 10 µm),
 # but its mean over ten seconds is good to about a micrometre, and knows nothing of mounts and cameras.
 #
 # Changes are compared with references that follow slowly while all agree, so that slow drift (a laser's mount, a
 # gauge's zero, creep) does not count as a contradiction; the shape loop handles it.
 
-# A laser's mount at 2 um/min is then 4 um ahead of its reference: less than the limit of 10 um.
+# A laser's mount at 2 µm/min is then 4 µm ahead of its reference: less than the limit of 10 µm.
 REFERENCE_S = 120.0
-# The second reference finds optics that drift by 0.034 um/s or more: 20 um ahead of it. Climate moves the gauge by at
-# most 0.028 um/s (see SINCE_HOUR_S), 17 um ahead of it; in the usual phase 13 um, less than the 2/3 of 20 um with
+# The second reference finds optics that drift by 0.034 µm/s or more: 20 µm ahead of it. Climate moves the gauge by at
+# most 0.028 µm/s (see SINCE_HOUR_S), 17 µm ahead of it; in the usual phase 13 µm, less than the 2/3 of 20 µm with
 # which a gauge that climate moves would side with the wrong one.
 SLOW_REFERENCE_S = 600.0
 # Of the limit between laser and optics.
@@ -284,7 +284,7 @@ class Liar(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Changes(StateNode):
-    """Changes of sag since the reference, as seen by the three, um."""
+    """Changes of sag since the reference, as seen by the three, µm."""
 
     laser_um: float
     optics_um: float
@@ -292,7 +292,7 @@ class Changes(StateNode):
 
     def __str__(self) -> str:
         """Format the changes as one line."""
-        return f"laser {self.laser_um:+.1f} um, camera {self.optics_um:+.1f} um, gauge {self.gauge_um:+.1f} um"
+        return f"laser {self.laser_um:+.1f} µm, camera {self.optics_um:+.1f} µm, gauge {self.gauge_um:+.1f} µm"
 
     def judge(self) -> Liar:
         """Which of laser and optics the gauge contradicts: it must be clearly nearer to the other one."""
@@ -318,7 +318,7 @@ class ReferenceMeans(StateNode):
         return math.isfinite(self.laser_um)
 
     def begin(self, means: tuple[float, float, float]) -> None:
-        """Place it at the present means of laser (um), optics (um) and gauge (Pa)."""
+        """Place it at the present means of laser (µm), optics (µm) and gauge (Pa)."""
         self.laser_um, self.optics_um, self.gauge_pa = means
 
     def follow(self, means: tuple[float, float, float], dt_s: float, time_constant_s: float) -> None:

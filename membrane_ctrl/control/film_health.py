@@ -27,8 +27,8 @@ WINDOW_S = 60.0
 # Before this the readings' noise and the pump's lag are a tenth of the leak.
 FIRST_S = 10.0
 
-# The loop moves the flow by 0.15 um/s (standard deviation) and the pump's least running flow is 0.3 um/s: with less
-# than this to make up for, the pump stops and starts, and in the end the band of 2 um is lost (docs/control.md).
+# The loop moves the flow by 0.15 µm/s (standard deviation) and the pump's least running flow is 0.3 µm/s: with less
+# than this to make up for, the pump stops and starts, and in the end the band of 2 µm is lost (docs/control.md).
 TOO_TIGHT_UM_PER_S = 0.4
 
 # A warning stands until the leak is clearly above the limit again.
@@ -169,7 +169,7 @@ class FilmHealth:
             (
                 "too_tight",
                 TOO_TIGHT_UM_PER_S / max(leak, 1e-6),
-                f"the mirror loses only {leak:.2f} um/s: open a bleed (loop.bleed_fraction)",
+                f"the mirror loses only {leak:.2f} µm/s: open a bleed (loop.bleed_fraction)",
             ),
             ("creep", creep / CREEP_PER_DAY, f"the film's compliance grows by {100 * creep:.1f} % a day"),
         )
@@ -190,7 +190,7 @@ class FilmHealth:
         growth_per_day = (leak_um_per_s - hours[0].leak_um_per_s) / days if days else 0.0
         left = (self._flow_max_um_per_s - leak_um_per_s) / growth_per_day if growth_per_day > 0 else math.inf
         until = f"; the pump keeps up for {left:.1f} days more" if left < 365 else ""
-        return f"the leak has grown to {leak_um_per_s:.2f} um/s{until}: look for an opening seam"
+        return f"the leak has grown to {leak_um_per_s:.2f} µm/s{until}: look for an opening seam"
 
     def _creep_per_day(self) -> float:
         """Creep over up to a day; 0 before six hours, as a shorter trend is noise."""

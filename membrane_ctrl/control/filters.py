@@ -75,7 +75,7 @@ class Slope(StateNode):
     """Least-squares slope of y over t, from running sums; times are counted from the first sample.
 
     With n evenly spread samples of noise sigma over a span T its standard deviation is sigma sqrt(12 / n) / T:
-    0.25 um/s for 1 um, 50 Hz and 1.5 s.
+    0.25 µm/s for 1 µm, 50 Hz and 1.5 s.
     """
 
     start_s: float = math.nan
@@ -136,7 +136,7 @@ class DriftTracker(StateNode):
         self.rate_um_per_s = 0.0
 
     def at(self, time_s: float, memory_s: float) -> float:
-        """Value in um expected at a time (not before the last reading's); a rate is believed for one memory."""
+        """Value in µm expected at a time (not before the last reading's); a rate is believed for one memory."""
         return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
 
     def take(self, reading_um: float, time_s: float, memory_s: float) -> None:

@@ -23,7 +23,7 @@ from membrane_ctrl.model.state_tree import StateNode
 # Margin above the stall command, so that a rounded register or a cold pump does not stall.
 STALL_MARGIN = 0.005
 
-# A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 um.
+# A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 µm.
 KICK_S = 0.1
 
 VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
@@ -140,7 +140,7 @@ class PumpCurve:
         self.memory.flow_um_per_s = 0.0
 
     def flow(self, fraction: float) -> float:
-        """Flow in um/s that a running pump gives for a command."""
+        """Flow in µm/s that a running pump gives for a command."""
         return min(max(self.memory.flow_um_per_s, self._rising.flow(fraction)), self._falling.flow(fraction))
 
     def fraction(self, flow_um_per_s: float) -> float:
@@ -164,7 +164,7 @@ class PumpCurve:
 
 # Flow that answers the weather before the laser sees it.
 #
-# Ambient pressure moves the centre by g_p (um/Pa) at once, gas temperature by g_T (um/K), and the gas follows the air
+# Ambient pressure moves the centre by g_p (µm/Pa) at once, gas temperature by g_T (µm/K), and the gas follows the air
 # with a lag T_g. The speed that cancels them is
 #
 #     v = -g_p d/dt lag(p, T_f) - g_T d/dt lag(T_air, T_g)
@@ -225,7 +225,7 @@ class FeedForward:
         self._loop = loop
 
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
-        """Flow in um/s; NaN for a missing quantity."""
+        """Flow in µm/s; NaN for a missing quantity."""
         loop = self._loop
         pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
         pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan

@@ -314,7 +314,7 @@ class InnerLoop:
         self.memory.matched.reset(setpoint_um)
 
     def _shape_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
-        """Advance the setpoint; return it as the loop sees it, and its speed in um/s."""
+        """Advance the setpoint; return it as the loop sees it, and its speed in µm/s."""
         if math.isnan(self.memory.setpoint_um):
             self._stand_at(filtered_um)
         if math.isnan(self._ramp.value_um):
@@ -332,7 +332,7 @@ class InnerLoop:
     def _output(
         self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float, filtered_um: float
     ) -> LoopOutput:
-        """The outputs of the tick; flows in um/s."""
+        """The outputs of the tick; flows in µm/s."""
         return LoopOutput(
             setpoint_um=self.memory.setpoint_um,
             filtered_um=filtered_um,

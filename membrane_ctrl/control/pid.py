@@ -8,7 +8,7 @@ Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4 and 3.5.
 
 The feed-forward is added afterwards, and the integrator ignores what the limits cut from it. Gusts are cut on one
 side only, as the pump removes no gas. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
-(v - u) into a mean error -(v - u) / K: measured with gusts, 0.18 um, and 0.00 without it.
+(v - u) into a mean error -(v - u) / K: measured with gusts, 0.18 µm, and 0.00 without it.
 """
 
 import math
@@ -24,7 +24,7 @@ from membrane_ctrl.model.state_tree import StateNode
 
 @dataclass(frozen=True, slots=True)
 class PidGains:
-    """Gains: K in 1/s (um/s of flow per um), times in s."""
+    """Gains: K in 1/s (µm/s of flow per µm), times in s."""
 
     kp_per_s: float
     ti_s: float
@@ -33,7 +33,7 @@ class PidGains:
 
 @dataclass(frozen=True, slots=True)
 class PidTerms:
-    """The three terms of one step, um/s."""
+    """The three terms of one step, µm/s."""
 
     p_um_per_s: float
     i_um_per_s: float

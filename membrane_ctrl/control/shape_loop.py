@@ -86,7 +86,7 @@ class ReferenceMean(StateNode):
 
 # Change of sag from the change of a Zernike vector.
 #
-# A change of sag moves the coefficients along a known direction s (the sensitivity, um per um). With the change
+# A change of sag moves the coefficients along a known direction s (the sensitivity, µm per µm). With the change
 # dc = c - c_ref and its covariance C the best linear unbiased estimate and its variance are (Gauss-Markov)
 #
 #     d = (s' W dc) / (s' W s),    var d = 1 / (s' W s),    W = (C + f^2 I)^-1
@@ -97,7 +97,7 @@ class ReferenceMean(StateNode):
 
 
 # Standard deviation of a coefficient's model error (assumed; a bench shows it as the scatter of the estimates):
-# 0.05 um RMS over the disc is 0.17 um of sag, which is what a cycle gives.
+# 0.05 µm RMS over the disc is 0.17 µm of sag, which is what a cycle gives.
 MODEL_FLOOR_UM = 0.05
 
 MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0 at the vertex
@@ -105,7 +105,7 @@ MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0
 
 @dataclass(frozen=True, slots=True)
 class SagChange(StateNode):
-    """Change of sag in um, positive when the bowl deepens, and its standard deviation."""
+    """Change of sag in µm, positive when the bowl deepens, and its standard deviation."""
 
     change_um: float
     sigma_um: float
@@ -116,7 +116,7 @@ def sag_change(
 ) -> SagChange:
     """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms, terms).
 
-    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the coefficients' change per um
+    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the coefficients' change per µm
     of sag.
     """
     s = sensitivity[MEASURED]
@@ -283,7 +283,7 @@ class ShapeLoop:
         if math.isnan(moved_um):
             return make_reason(ShapeCode.NO_LASER, "no laser reading to compare the shape with")
         if moved_um > config.disagreement_max_um:
-            moved = f"the laser has moved by {moved_um:.1f} um since the exposures"
+            moved = f"the laser has moved by {moved_um:.1f} µm since the exposures"
             return make_reason(ShapeCode.LASER_MOVED, moved)
         return NO_REASON
 
@@ -312,7 +312,7 @@ class ShapeLoop:
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
         apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
-            apart = f"camera and laser disagree by {apart_um:+.1f} um: check the laser's mount, or lock again"
+            apart = f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or lock again"
             self._refuse(make_reason(ShapeCode.DISAGREE, apart))
             return
         memory.admitted_s = estimate.time_s
@@ -330,5 +330,5 @@ class ShapeLoop:
         step_um = config.trim_rate_max_um_per_s * dt_s
         memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)
         at_limit = bounded_um != goal_um
-        limited = f"trim at its limit of {config.trim_max_um:g} um"
+        limited = f"trim at its limit of {config.trim_max_um:g} µm"
         memory.reason = make_reason(ShapeCode.TRIM_LIMIT, limited) if at_limit else NO_REASON

@@ -78,7 +78,7 @@ class Request(Section):
     # this connection), `release` (give up command), `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
-    value: float | None = None  # `setpoint`: um. `manual`: um/s. `gains`: trial time, s
+    value: float | None = None  # `setpoint`: µm. `manual`: µm/s. `gains`: trial time, s
     # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a person typed. `claim`:
     # the session's name
     text: Annotated[str, _words(TEXT_BYTES)] = ""

@@ -46,7 +46,7 @@ class Command:
     kind: Kind | Literal["resumed", "latched"]
     who: str  # recorded, as is `why`
     why: str = ""
-    # `setpoint`: um. `manual`: flow, um/s of the centre. `gains`: trial time, s; NaN: no trial. `resumed`: age of the
+    # `setpoint`: µm. `manual`: flow, µm/s of the centre. `gains`: trial time, s; NaN: no trial. `resumed`: age of the
     # resume, s
     value: float = math.nan
     # `mark`: text for the timeline. `latch`: why the mirror is locked. `unlock`: the typed word. `latched`: the fault
@@ -80,11 +80,11 @@ _HOLD, _PARKED, _FLOW = (
 )
 
 TABLE: dict[Kind, CommandRule] = {
-    "setpoint": CommandRule("operate", RUNNING, "Ramp to a laser setpoint, in um.", needs=("value",)),
+    "setpoint": CommandRule("operate", RUNNING, "Ramp to a laser setpoint, in µm.", needs=("value",)),
     "hold": CommandRule("operate", _PARKED, "Hold the mirror, or return to holding it."),
     "pause": CommandRule("operate", _HOLD, "Pause the loop; the pump keeps its mean flow."),
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
-    "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in um/s of the centre.", needs=("value",)),
+    "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in µm/s of the centre.", needs=("value",)),
     "gains": CommandRule(
         "tune",
         RUNNING,
@@ -137,10 +137,10 @@ def refusal(command: Command, state: State, config: Config) -> str:
     if command.kind == "setpoint":
         low, high = config.limits.displacement_min_um, config.limits.displacement_max_um
         if not low < command.value < high:
-            return f"setpoint {command.value:g} um is outside the limits ({low:g} .. {high:g} um)"
+            return f"setpoint {command.value:g} µm is outside the limits ({low:g} .. {high:g} µm)"
     most_um_per_s = config.loop.flow_most_um_per_s(config.pump)
     if command.kind == "manual" and not 0.0 <= command.value <= most_um_per_s:
-        return f"flow {command.value:g} um/s is outside 0 .. {most_um_per_s:g} um/s"
+        return f"flow {command.value:g} µm/s is outside 0 .. {most_um_per_s:g} µm/s"
     if command.kind == "tune" and command.experiment is None:
         return "tune: experiment missing"
     if command.kind == "gains" and command.loop is None:

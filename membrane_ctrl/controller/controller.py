@@ -46,7 +46,7 @@ _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
 class Controller:
     """Owns the state machine, the safety table and both loops.
 
-    `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in um per um, for the shape
+    `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in µm per µm, for the shape
     loop.
     """
 

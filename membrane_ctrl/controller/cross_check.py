@@ -27,8 +27,8 @@ from membrane_ctrl.controller import (
 from membrane_ctrl.model.errors import FindingsError
 
 _RESUMES_MOST = 24  # a day: the cause of a fault that recurs more than once an hour is not temporary
-# How long the pump may run without control, and how long at an uncorrected flow. At 5 um/s and at the 1.2 um/s of a
-# doubled leak that is 10 um and 70 um, well within the default limits.
+# How long the pump may run without control, and how long at an uncorrected flow. At 5 µm/s and at the 1.2 µm/s of a
+# doubled leak that is 10 µm and 70 µm, well within the default limits.
 _UNATTENDED_S, _BLIND_S = 2.0, 60.0
 _PAUSE_S = 3600.0  # the laser still guards the limits, but no loop holds the mirror
 _PUMP_STANDS_S = 0.5  # lag and transport
@@ -199,18 +199,18 @@ def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     above_um, below_um = limits.displacement_max_um - setpoint_um, setpoint_um - limits.displacement_min_um
     field = "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um"
     for room_um, side in ((above_um, "above"), (below_um, "below")):
-        why = f"trim and band reach the limit, {room_um:g} um {side} the setpoint ({setpoint_um:g} um)"
+        why = f"trim and band reach the limit, {room_um:g} µm {side} the setpoint ({setpoint_um:g} µm)"
         remedy = "lower it, or move the setpoint or the limits"
         say.error(trim_um + limits.band_um >= room_um, field, why, remedy)
     following_um, room_um = limits.following_error_max_um, min(above_um, below_um)
-    why, less = "can never trip: a displacement limit trips first", f"set less than {room_um:g} um"
+    why, less = "can never trip: a displacement limit trips first", f"set less than {room_um:g} µm"
     say.warn(following_um >= room_um, "limits.following_error_max_um", why, less)
-    why = f"a mirror inside the band would be a following error ({following_um:g} um)"
+    why = f"a mirror inside the band would be a following error ({following_um:g} µm)"
     say.error(limits.band_um >= following_um, "limits.band_um", why, "keep it below limits.following_error_max_um")
     step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
-    why = f"a moving film ({step_um:.2f} um a tick) and the laser's noise (1 um) reach it"
-    say.error(limits.step_max_um < 4.0 + step_um, "limits.step_max_um", why, f"set at least {4.0 + step_um:.0f} um")
-    why = f"can never trip: the limit is {above_um:g} um above the setpoint"
+    why = f"a moving film ({step_um:.2f} µm a tick) and the laser's noise (1 µm) reach it"
+    say.error(limits.step_max_um < 4.0 + step_um, "limits.step_max_um", why, f"set at least {4.0 + step_um:.0f} µm")
+    why = f"can never trip: the limit is {above_um:g} µm above the setpoint"
     say.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
 
 

@@ -82,11 +82,11 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
         say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts that late", "measure it")
     else:
         least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
-        why = f"a running pump gives at least {least_um_per_s:.2f} um/s: it would only switch on and off"
+        why = f"a running pump gives at least {least_um_per_s:.2f} µm/s: it would only switch on and off"
         remedy = "set several times as much, or measure pump.stall_fraction"
         say.error(loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy)
     more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
-    why = f"the pump gives {pump.flow_full_um_per_s:g} um/s (pump.flow_full_um_per_s)"
+    why = f"the pump gives {pump.flow_full_um_per_s:g} µm/s (pump.flow_full_um_per_s)"
     say.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
     if config.devices is None:
         return
@@ -127,7 +127,7 @@ def _leak_estimate(config: Config) -> str:
     speed_um_per_s = 1e3 * mirror.sag_mm / (3.0 * time_constant_s)
     return (
         f", from {mirror.pressure_pa:g} to {end_pa:g} Pa in about {takes_s / 3600.0:.2g} h (estimated with "
-        f"twin.leak_time_constant_s = {time_constant_s:g} s, which is a leak of {speed_um_per_s:.2g} um/s)"
+        f"twin.leak_time_constant_s = {time_constant_s:g} s, which is a leak of {speed_um_per_s:.2g} µm/s)"
     )
 
 
@@ -157,15 +157,15 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
         say.error(on and share < 0.0, f"loop.{name}", "wrong sign: it would double the weather's effect", remedy)
         why = "more than twice the physical value: worse than no feed-forward"
         say.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
-    why = f"faster than the pump's {full_um_per_s:g} um/s"
+    why = f"faster than the pump's {full_um_per_s:g} µm/s"
     say.warn(loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it")
     bleed_um_per_s = loop.bleed_fraction * gas.VENT_FULL_UM_PER_S
-    why = f"the vent would take about {bleed_um_per_s:.0f} um/s, half of the pump's flow or more"
+    why = f"the vent would take about {bleed_um_per_s:.0f} µm/s, half of the pump's flow or more"
     remedy = f"set less than {0.5 * full_um_per_s / gas.VENT_FULL_UM_PER_S:.3f}"
     say.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
     swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
     why = f"the pump needs {swing_s:.0f} s from none to full: the loop would swing"
-    remedy = f"set at least {0.5 * full_um_per_s:.1f} um/s2"
+    remedy = f"set at least {0.5 * full_um_per_s:.1f} µm/s2"
     say.error(swing_s > 2.0, "loop.flow_rate_limit_um_per_s2", why, remedy)
 
 
@@ -179,10 +179,10 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
     say.error(shape.time_constant_s < 2.0 * shape.period_s, "shape.time_constant_s", why, "set 20 periods")
     outruns = shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s
     why = "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)"
-    say.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 um/s")
+    say.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 µm/s")
     never = shape.disagreement_max_um >= config.limits.displacement_max_um - config.loop.setpoint_um
     why = "can never trip: limits.displacement_max_um trips first"
-    say.error(never, "shape.disagreement_max_um", why, "set 10 um")
+    say.error(never, "shape.disagreement_max_um", why, "set 10 µm")
     why = f"a cycle of 8 frames does not fit into shape.period_s ({shape.period_s:g} s)"
     say.warn(8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it")
 
@@ -255,11 +255,11 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
         ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
     ):
-        why = f"can never trip: limits.displacement_max_um is {above_um:g} um above the setpoint"
+        why = f"can never trip: limits.displacement_max_um is {above_um:g} µm above the setpoint"
         say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
         why = f"{by} alone reach it"
-        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} um")
-    why, least = "a day's temperature and humidity alone reach it", f"set at least {_CLIMATE_UM:g} um"
+        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} µm")
+    why, least = "a day's temperature and humidity alone reach it", f"set at least {_CLIMATE_UM:g} µm"
     say.error(limits.laser_gauge_day_max_um < _CLIMATE_UM, "limits.laser_gauge_day_max_um", why, least)
 
 
@@ -267,7 +267,7 @@ def judge_film(config: Config, say: ConfigFindings) -> None:
     """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
-    growth, why = "limits.leak_growth_max", f"can never trip: the pump gives {flow_um_per_s(config):g} um/s"
+    growth, why = "limits.leak_growth_max", f"can never trip: the pump gives {flow_um_per_s(config):g} µm/s"
     say.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
     least = f"set at least {film.CONTRADICTED_MOST:g}"
     say.error(
@@ -299,7 +299,7 @@ def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> N
     low_um = max(min(stated_um), board.displacement_range_um[0])
     high_um = min(max(stated_um), board.displacement_range_um[1])
     full_pa = min(max(stated_pa), board.gauge_range_pa[1])
-    why, remedy = f"can never trip: the laser's range is {low_um:g} .. {high_um:g} um", "change it, or move the laser"
+    why, remedy = f"can never trip: the laser's range is {low_um:g} .. {high_um:g} µm", "change it, or move the laser"
     say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", why, remedy)
     say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", why, remedy)
     pressure, why = "limits.gauge_pressure_max_pa", f"can never trip: the gauge shows at most {full_pa:g} Pa"

@@ -16,7 +16,7 @@ from membrane_ctrl.model.state_tree import Count, StateNode
 
 # The loop needs a figure younger than this, or than so many intervals of the tracking.
 _LOOP_AGE_S, _LOOP_INTERVALS = 1.0, 5
-# Range and limits may be judged by an older one: two cycles, in which the pump lifts the film by at most 26 um.
+# Range and limits may be judged by an older one: two cycles, in which the pump lifts the film by at most 26 µm.
 _GUARD_AGE_S = 5.0
 _JUMPED = 5  # figures in a row that no film can show; one or two are bad figures
 _REPEATS = 3  # no two figures have the same noise
@@ -24,7 +24,7 @@ _REPEATS = 3  # no two figures have the same noise
 _CAMERA_STARTS_S = 900.0
 # The configured sag is known within this factor; a wrong unit or sign is further off.
 _SAG_FACTOR = 2.0
-# The optics' zero against the laser's reading is a mean over this: a mount at 2 um/min is 2 um ahead of it.
+# The optics' zero against the laser's reading is a mean over this: a mount at 2 µm/min is 2 µm ahead of it.
 _ALIGN_S = 60.0
 
 
@@ -127,7 +127,7 @@ class FigureGate:
         if now_s - self.memory.newest_s > _GUARD_AGE_S and math.isfinite(laser_um):
             self.memory.jumps.forget()  # the film may have moved meanwhile; the laser judges
         if self.memory.jumps.refuse(figure.sag_um, self._step_max_um):
-            self.memory.defect_detail = f"by {figure.sag_um - self.memory.newest_sag_um:+.0f} um"
+            self.memory.defect_detail = f"by {figure.sag_um - self.memory.newest_sag_um:+.0f} µm"
             return FigureDefect.JUMP
         return None
 
@@ -159,22 +159,22 @@ class FigureGate:
 
     @property
     def sag_um(self) -> float:
-        """Sag by the newest figure, um; NaN if it is too old for range and limits, or repeats itself."""
+        """Sag by the newest figure, µm; NaN if it is too old for range and limits, or repeats itself."""
         return self.memory.newest_sag_um if self._sound and self.newest_age_s <= self._guard_age_s else math.nan
 
     @property
     def zero_um(self) -> float:
-        """Sag at displacement 0, um; NaN until sag and laser have been compared."""
+        """Sag at displacement 0, µm; NaN until sag and laser have been compared."""
         return self.memory.zero_um.value
 
     @property
     def guard_um(self) -> float:
-        """Displacement by which range and limits may be judged, um; NaN without one."""
+        """Displacement by which range and limits may be judged, µm; NaN without one."""
         return self.sag_um - self.memory.zero_um.value
 
     @property
     def loop_um(self) -> float:
-        """Displacement that a loop may follow, um; NaN without one."""
+        """Displacement that a loop may follow, µm; NaN without one."""
         return self.guard_um if self.newest_age_s <= self._loop_age_s else math.nan
 
     @property

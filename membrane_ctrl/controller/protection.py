@@ -162,9 +162,9 @@ class Failure(Enum):
     """How a sensor of the film fails, in classes of equal bounds; the value is a phrase for people."""
 
     LOST = "lost, frozen to the last bit, of bad quality, or with wrong times"
-    STEP = "a step, or a drift of 1 um/s or more"
-    DRIFT = "a drift of 0.05 or 0.2 um/s"
-    DRIFT_WITHIN_CLIMATE = "a drift of 0.02 um/s, which climate may hide"
+    STEP = "a step, or a drift of 1 µm/s or more"
+    DRIFT = "a drift of 0.05 or 0.2 µm/s"
+    DRIFT_WITHIN_CLIMATE = "a drift of 0.02 µm/s, which climate may hide"
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,12 +175,12 @@ class Bound:
     distance_um: float
 
 
-# The pump moves the film by 5.3 um/s at most: means over ten seconds find that after 53 um, and some um more are gone
+# The pump moves the film by 5.3 µm/s at most: means over ten seconds find that after 53 µm, and some µm more are gone
 # until the pump is off.
 _FAST_MOTION_UM = 65.0
 # The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30 % of its pressure
-# is linear in the sag, the gauge shows 80 %. A drift of 0.05 um/s then passes the limit by little and late: the
-# protection campaign measured 313 um after 1.7 h.
+# is linear in the sag, the gauge shows 80 %. A drift of 0.05 µm/s then passes the limit by little and late: the
+# protection campaign measured 313 µm after 1.7 h.
 _DRIFT_FACTOR = 3.0
 # As much further goes a drift while the day's reference follows it.
 _DAY_FACTOR = 1.3

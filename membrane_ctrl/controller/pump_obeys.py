@@ -17,16 +17,16 @@ from membrane_ctrl.model.state_tree import Count, StateNode
 
 # A flow controller's zero and a tachometer's last count are below this; no pump moves gas below 0.1
 OFF_FRACTION = 0.02
-# Readings are averaged over blocks, which leaves 0.2 um and 0.1 Pa of noise at 50 Hz
+# Readings are averaged over blocks, which leaves 0.2 µm and 0.1 Pa of noise at 50 Hz
 _BLOCK_S = 0.5
 # A block is compared with the one 20 s before. In 12 h of the twin with the pump off, gusty weather and films that
-# lose no gas, the mirror rose by at most 11.4 um (0.74 Pa); a pump at half of its range lifts it by 44 um (3.6 Pa)
+# lose no gas, the mirror rose by at most 11.4 µm (0.74 Pa); a pump at half of its range lifts it by 44 µm (3.6 Pa)
 _WINDOW_S = 20.0
 _RISE_MAX_UM = 30.0
 _PA_PER_UM = 0.05  # 3p/s is 0.065 Pa/um at the working point; less makes the gauge the slower check
 # The gas follows the air within 12 s: a change up to 40 s before the window still moves the mirror in it
 _WEATHER_BLOCKS = 120
-# The end of a run waits for this many blocks without a rise as steep as a pump's: 3 um/s (weather: 2.2 um/s)
+# The end of a run waits for this many blocks without a rise as steep as a pump's: 3 µm/s (weather: 2.2 µm/s)
 _REST_BLOCKS = 5
 _REST_RISE_MAX_UM = 6.0
 
@@ -204,7 +204,7 @@ class Standstill:
         rises = [rise > most for rise, most in checks if math.isfinite(rise)]
         if not rises or not all(rises):
             return ""
-        return f"{rise_um:+.0f} um, {rise_pa:+.1f} Pa in {over_s:.0f} s with the pump commanded off"
+        return f"{rise_um:+.0f} µm, {rise_pa:+.1f} Pa in {over_s:.0f} s with the pump commanded off"
 
 
 def _range(values: Iterable[float]) -> float:
@@ -224,12 +224,12 @@ class Part:
     measure_s: float
 
 
-# The vent costs 7 um of height, which the pump must restore. The pump comes last, at 0.8: its gas is needed on the
+# The vent costs 7 µm of height, which the pump must restore. The pump comes last, at 0.8: its gas is needed on the
 # way to the setpoint anyway.
 PARTS = (Part("off", 0.0, 0.0, 0.0, 1.2), Part("vent", 0.0, 0.08, 0.35, 0.5), Part("pump", 0.8, 0.0, 0.5, 1.0))
 _RATE_HZ = 50.0  # tick rate of the parts' times
-# At 50 Hz and with 1 um of noise the vent's speed has a standard deviation of 1.4 um/s, the pump's 0.6 um/s, and the
-# means of two 1.0 and 0.4 um/s. Three of them are clear; two and a half decide in the end.
+# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's 0.6 µm/s, and the
+# means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in the end.
 _VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
 _PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
@@ -241,7 +241,7 @@ class ActuatorTestState(StateNode):
     pump: PumpConfig
     test_vent: bool
     speeds: dict[str, Slope]  # by part
-    before: dict[str, float] = field(default_factory=dict)  # of the first run, um/s
+    before: dict[str, float] = field(default_factory=dict)  # of the first run, µm/s
     elapsed_s: float = 0.0
 
 
@@ -250,7 +250,7 @@ class ActuatorTest:
 
     The speed of the centre in each part is the slope of the laser readings. The test checks sign and size within a
     factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30 % too weak. After
-    an unclear response it runs again; then a clear response suffices, otherwise the mean of both decides. With 1 um
+    an unclear response it runs again; then a clear response suffices, otherwise the mean of both decides. With 1 µm
     of noise a good bench needs the second run in one start of a hundred.
 
     Parameters
@@ -332,9 +332,9 @@ class ActuatorTest:
         if "vent" in speeds:
             vent_um_per_s = speeds["off"] - speeds["vent"]
             if vent_um_per_s < vent_least_um_per_s:
-                return f"the vent lets the mirror down by only {vent_um_per_s:.1f} um/s"
+                return f"the vent lets the mirror down by only {vent_um_per_s:.1f} µm/s"
         expected_um_per_s = gas.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
         rise_um_per_s = speeds["pump"] - speeds["off"]
         if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
-            return f"the pump lifts the mirror by {rise_um_per_s:.1f} um/s, not by about {expected_um_per_s:.1f} um/s"
+            return f"the pump lifts the mirror by {rise_um_per_s:.1f} µm/s, not by about {expected_um_per_s:.1f} µm/s"
         return ""

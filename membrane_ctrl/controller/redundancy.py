@@ -110,7 +110,7 @@ class RedundancyWatch:
         ]
         return (
             f"{sensor.value} and gauge are left, and the gauge bounds an error of the {sensor.value} to "
-            f"{bounds[0]:.0f} um within minutes, {bounds[1]:.0f} um within hours, {bounds[2]:.0f} um within days"
+            f"{bounds[0]:.0f} µm within minutes, {bounds[1]:.0f} µm within hours, {bounds[2]:.0f} µm within days"
         )
 
 

@@ -133,7 +133,7 @@ class Rule:
 
 
 _FOREIGN = {FOREIGN_CLAIM: "another claim is in force", FOREIGN_PERIOD: "another watchdog period is in force"}
-# One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the film by 0.2 um
+# One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the film by 0.2 µm
 _TWICE = (2, 3)
 # The pump follows with its lag (0.15 s) and a tick or two; the loop's noise hides a constant difference in some ticks
 _FOLLOWED = (40, 50)
@@ -153,7 +153,7 @@ TABLE: tuple[Rule, ...] = (
         code=21, name="over_displacement", cause="the bowl is deeper than its limit",
         limit="limits.displacement_max_um", safe_level=SafeLevel.VENT, seen_in=_TWICE, states=ALWAYS,
         remedy="check the laser against a ruler, then the setpoint and the limits",
-        seen=lambda o: f"{o.depth_um:.1f} um", broken=lambda o, c: o.depth_um > c.displacement_max_um,
+        seen=lambda o: f"{o.depth_um:.1f} µm", broken=lambda o, c: o.depth_um > c.displacement_max_um,
         unseen=lambda o: math.isnan(o.depth_um),
     ),
     Rule(
@@ -164,7 +164,7 @@ TABLE: tuple[Rule, ...] = (
     ),
     Rule(
         code=36, name="gas_comes_in", cause="the mirror rises although the pump is commanded off",
-        limit="30 um in 20 s beyond what the weather explains", safe_level=SafeLevel.VENT, states=ALWAYS - MOVING,
+        limit="30 µm in 20 s beyond what the weather explains", safe_level=SafeLevel.VENT, states=ALWAYS - MOVING,
         remedy="cut the pump's power or shut its gas: its read-back may be wrong, or gas comes another way",
         seen=lambda o: o.inflow, broken=lambda o, c: bool(o.inflow),
     ),
@@ -307,14 +307,14 @@ TABLE: tuple[Rule, ...] = (
         code=22, name="under_displacement", cause="the bowl is shallower than its limit",
         limit="limits.displacement_min_um", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE, states=HOLDING,
         remedy="look for a leak or a laser that was moved",
-        seen=lambda o: f"{o.depth_um:.1f} um", broken=lambda o, c: o.depth_um < c.displacement_min_um,
+        seen=lambda o: f"{o.depth_um:.1f} µm", broken=lambda o, c: o.depth_um < c.displacement_min_um,
         unseen=lambda o: math.isnan(o.depth_um),
     ),
     Rule(
         code=23, name="following_error", cause="the mirror does not follow its setpoint",
         limit="limits.following_error_max_um", safe_level=SafeLevel.RAMP_DOWN, seen_in=(100, 100), states=HOLDING,
         remedy="look for a leak, a stuck pump or a mirror that is too tight",
-        seen=lambda o: f"{o.error_um:.1f} um", broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,
+        seen=lambda o: f"{o.error_um:.1f} µm", broken=lambda o, c: abs(o.error_um) > c.following_error_max_um,
         unseen=lambda o: math.isnan(o.error_um),
     ),
     Rule(

@@ -333,7 +333,7 @@ class SensorConsistency:
         if not noticed:
             return [MaintenanceOver("slow_drift", "the two are near each other again")]
         message = (
-            f"{sensor} and gauge have moved {monitor.drift_um:.0f} um apart within a day: humidity and "
+            f"{sensor} and gauge have moved {monitor.drift_um:.0f} µm apart within a day: humidity and "
             "temperature of the film do this, and so does a sensor that drifts. Compare the laser with a ruler"
         )
         return [Maintenance("slow_drift", message)]
@@ -444,7 +444,7 @@ class MountDrift:
         self.memory = memory or MountDriftState()
 
     def start(self, mount_um: float) -> None:
-        """Count from a place of the mount, in um."""
+        """Count from a place of the mount, in µm."""
         self.memory.start_afresh()
         self.memory.last_um = mount_um
 
@@ -477,7 +477,7 @@ class MountDrift:
         if not memory.beyond_limit:
             return []
         message = (
-            f"laser and optics have drifted {self._most_um:g} um apart; which of them is not known, and the mirror "
+            f"laser and optics have drifted {self._most_um:g} µm apart; which of them is not known, and the mirror "
             "follows the laser. Check its mount and the optics, then `ctl shape off` and `on` accept the figure"
         )
         return [Maintenance("trim_limit", message)]
@@ -656,7 +656,7 @@ class Holders:
         if not far:
             return [MaintenanceOver("stand_growth", stands)]
         anew = "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
-        return [Maintenance("stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} um; {anew}")]
+        return [Maintenance("stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} µm; {anew}")]
 
     def _sees(self, sensor: Sensor) -> bool:
         estimate = self.memory.estimate

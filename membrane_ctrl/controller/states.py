@@ -81,7 +81,7 @@ def inflate(scene: Scene) -> State:
     output = _drive(scene, scene.loop.ramp_um if lag > 1.0 else scene.setpoint_um)
     to_go_um = scene.setpoint_um - output.filtered_um
     unseen = NO_REASON if math.isfinite(to_go_um) else scene.observer.unseen
-    to_go = f"{to_go_um:.1f} um to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
+    to_go = f"{to_go_um:.1f} µm to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
     # A waiting ramp starts and stops at the limit, several times a second: the reason must not.
     waits = lag > 0.8
     inflating = f"inflating: {to_go}{', the ramp waits for the mirror' if waits else ''}"
@@ -93,9 +93,9 @@ def inflate(scene: Scene) -> State:
     if math.isfinite(to_go_um) and (rises or to_go_um <= 0.0):  # from above the leak lowers it, however slowly
         scene.highest_um, scene.highest_s = output.filtered_um, scene.now_s
     if scene.now_s - scene.highest_s > states.inflate_stall_s:
-        scene.overdue = f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} um below the setpoint"
+        scene.overdue = f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} µm below the setpoint"
     elif scene.state_age_s > states.inflate_timeout_s:
-        scene.overdue = f"still {to_go_um:.0f} um from the setpoint"
+        scene.overdue = f"still {to_go_um:.0f} µm from the setpoint"
     return State.INFLATE
 
 
@@ -106,11 +106,11 @@ def settle(scene: Scene) -> State:
     settled_s = scene.stay_good(not abs(output.error_um) >= band_um)  # a lost reading is no error
     scene.explain(WhyCode.SETTLING, f"settling: inside the band for {settled_s:.0f} s")
     if settled_s >= scene.config.states.settle_s:
-        scene.explain(WhyCode.SETTLED, f"inside +-{band_um:g} um for {settled_s:.1f} s")
+        scene.explain(WhyCode.SETTLED, f"inside +-{band_um:g} µm for {settled_s:.1f} s")
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
         swings = "if it swings, halve loop.kp_per_s and double loop.ti_s"
-        scene.overdue = f"not inside +-{band_um:g} um for {scene.config.states.settle_s:g} s: {swings}"
+        scene.overdue = f"not inside +-{band_um:g} µm for {scene.config.states.settle_s:g} s: {swings}"
     return State.SETTLE
 
 
@@ -139,7 +139,7 @@ def manual(scene: Scene) -> State:
     if over:
         scene.explain(WhyCode.MANUAL_OVER, f"manual is over: {over}")
         return State.INFLATE
-    manual = f"manual: {scene.asked_by} set the flow to {scene.manual_um_per_s:.2f} um/s"
+    manual = f"manual: {scene.asked_by} set the flow to {scene.manual_um_per_s:.2f} µm/s"
     scene.explain(WhyCode.MANUAL, manual, scene.asked_by)
     return State.MANUAL
 
@@ -287,7 +287,7 @@ def _manual_over(scene: Scene) -> str:
     if scene.levels.safe_level != SafeLevel.NONE:
         return "the safety table holds the mean flow"
     if scene.strayed:
-        return f"more than {states.manual_range_um:g} um from the setpoint"
+        return f"more than {states.manual_range_um:g} µm from the setpoint"
     if scene.now_s - scene.manual_since_s > states.manual_max_s:
         return f"no flow was set for {states.manual_max_s:g} s"
     return ""
@@ -346,7 +346,7 @@ def _running_test(scene: Scene) -> pump_obeys.ActuatorTest:
 def _begin(scene: Scene, leak_um_per_s: float) -> State:
     """Hand over to the loop at the flow that balances the leak, so that the integrator need not find it."""
     scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
-    scene.explain(WhyCode.CHECKED, f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} um/s")
+    scene.explain(WhyCode.CHECKED, f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} µm/s")
     scene.pump_fraction = scene.last_pump_fraction
     return State.INFLATE
 

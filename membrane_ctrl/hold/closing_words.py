@@ -94,8 +94,8 @@ def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None
 
 def _headline(summary: dict[str, object]) -> Iterator[str]:
     labels: dict[str, tuple[str, Callable[[float], str]]] = {
-        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} um"),
-        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} um"),
+        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} µm"),
+        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} µm"),
         "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
         "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
         "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),

@@ -214,7 +214,7 @@ def _zygo_dat(seen: ExportedMap, _: object) -> Written:
 
 
 def _zygo_xyz(seen: ExportedMap, _: object) -> Written:
-    """MetroPro's text of points: column, row, height in um."""
+    """MetroPro's text of points: column, row, height in µm."""
     rows, columns = seen.height_mm.shape
     head = (
         "Zygo XYZ Data File - Format 1",
@@ -245,7 +245,7 @@ _CODEV_MOST, _CODEV_MISSING = 32767, -32768
 
 
 def _codev_int(seen: ExportedMap, _: object) -> Written:
-    """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength of 1 um."""
+    """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength of 1 µm."""
     per_um = _CODEV_MOST / max(1e3 * float(np.nanmax(np.abs(seen.height_mm))), 1e-6)
     scale = float(f"{per_um:.9g}")  # as the file states it
     rows, columns = seen.height_mm.shape

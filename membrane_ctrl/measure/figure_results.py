@@ -167,10 +167,10 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
 
     lines = [
         f"sphere    radius {told('radius_of_curvature_mm', 'mm')}, focal length {told('focal_length_mm', 'mm')}",
-        f"irregular PV {told('irregularity_pv_um', 'um')}, RMS {told('irregularity_rms_um', 'um')}, "
-        f"PVr {told('pvr_um', 'um')}; slope {told('slope_rms_urad', 'urad')} RMS",
-        f"          rotationally invariant PV {told('rotational_pv_um', 'um')}, "
-        f"the rest {told('asymmetry_rms_um', 'um')} RMS",
+        f"irregular PV {told('irregularity_pv_um', 'µm')}, RMS {told('irregularity_rms_um', 'µm')}, "
+        f"PVr {told('pvr_um', 'µm')}; slope {told('slope_rms_urad', 'µrad')} RMS",
+        f"          rotationally invariant PV {told('rotational_pv_um', 'µm')}, "
+        f"the rest {told('asymmetry_rms_um', 'µm')} RMS",
     ]
     if numbers.best_focus_mm > 0:
         lines.append(
@@ -234,7 +234,7 @@ def _report_tables(figure: dict[str, Any]) -> list[ReportTable]:
     if figure["not_given"]:
         tables.append(("Not given", [("number", "reason"), *figure["not_given"].items()]))
     for terms in figure["zernike"]:
-        rows = [("j", "coefficient, um", "1 sigma, noise", "1 sigma, geometry")]
+        rows = [("j", "coefficient, µm", "1 sigma, noise", "1 sigma, geometry")]
         columns = (terms[key] for key in ("coeffs_um", "sigma_noise_um", "sigma_geometry_um"))
         rows += [(str(j), *map(cell, row)) for j, row in enumerate(zip(*columns, strict=True), terms["first"])]
         heading = f"Zernike terms, {terms['index']}, {terms['normalisation']} 1 over {terms['radius_mm']:g} mm"

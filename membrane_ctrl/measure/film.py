@@ -204,7 +204,7 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
     sags = [figure.sag_mm for figure in figures]
     lines = [
         f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; geometry: {table['geometry']}",
-        f"pre-strain {1e6 * strain['value']:.1f} +- {1e6 * strain['sigma']:.2g} um/m",
+        f"pre-strain {1e6 * strain['value']:.1f} +- {1e6 * strain['sigma']:.2g} µm/m",
         f"nu         {poisson['value']:.4f} +- {poisson['sigma']:.2g}",
     ]
     if stiffness is not None:
@@ -219,8 +219,8 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
         *lines,
         f"Hencky     the measured edge is {min(edges):+.3f} to {max(edges):+.3f} mm from Hencky's film of 205 kN/m, "
         f"nu 0.3; the law explains {100 * table['explained']:.1f} %",
-        f"misfit     {table['misfit_um']:.3g} um a term that no law explains; it is in the bars",
-        f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} um/m in this film",
+        f"misfit     {table['misfit_um']:.3g} µm a term that no law explains; it is in the bars",
+        f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} µm/m in this film",
         *(f"note       {note}" for note in table["notes"]),
     ]
 
@@ -234,7 +234,7 @@ def _draw(path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit,
         seen.plot(departure.radius_mm, profile, label=f"{figure.name}, {figure.sag_mm:.1f} mm")
         left.plot(departure.radius_mm, 1e3 * rest)
     seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")
-    left.set(title=f"less the law ({100 * departure.explained:.1f} % explained)", xlabel="radius (mm)", ylabel="um")
+    left.set(title=f"less the law ({100 * departure.explained:.1f} % explained)", xlabel="radius (mm)", ylabel="µm")
     seen.legend(fontsize=8)
     angle = np.linspace(0, 2 * np.pi, 181)
     root = np.linalg.cholesky(fit.covariance[:2, :2])
@@ -243,6 +243,6 @@ def _draw(path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit,
         strain, poisson = centre[:, None] + sigmas * root @ np.stack([np.cos(angle), np.sin(angle)])
         both.plot(1e6 * strain, poisson, label=f"{sigmas} sigma")
     both.plot(1e6 * centre[0], centre[1], "+", color="black")
-    both.set(title="pre-strain and Poisson ratio", xlabel="pre-strain (um/m)", ylabel="nu")
+    both.set(title="pre-strain and Poisson ratio", xlabel="pre-strain (µm/m)", ylabel="nu")
     both.legend(fontsize=8)
     write_figure(path, drawing)

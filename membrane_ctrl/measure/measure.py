@@ -112,15 +112,15 @@ def _lines(
     residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
-        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} um from noise and the film, "
-        f"{of_geometry:.3g} um from the geometry",
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} µm from noise and the film, "
+        f"{of_geometry:.3g} µm from the geometry",
         f"geometry  {bars.source}",
-        f"budget    1 sigma of height {total['height_rms_um']:.3g} um RMS, without its plane "
-        f"{total['figure_rms_um']:.3g} um; largest: {largest}",
+        f"budget    1 sigma of height {total['height_rms_um']:.3g} µm RMS, without its plane "
+        f"{total['figure_rms_um']:.3g} µm; largest: {largest}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
-        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} um, coma {np.hypot(*coeffs[6:8]):.2f} um, "
-        f"trefoil {np.hypot(*coeffs[8:10]):.2f} um (RMS)",
-        f"residual  {full.quality.residual_urad:.2f} urad of slope, {residual_um.std():.3f} um RMS of height",
+        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} µm, coma {np.hypot(*coeffs[6:8]):.2f} µm, "
+        f"trefoil {np.hypot(*coeffs[8:10]):.2f} µm (RMS)",
+        f"residual  {full.quality.residual_urad:.2f} µrad of slope, {residual_um.std():.3f} µm RMS of height",
         f"fit       {len(full.fit.changes_mm)} iterations, last change {full.fit.changes_mm[-1]:.1e} mm, "
         f"{np.count_nonzero(full.weights)} pixels",
     ]

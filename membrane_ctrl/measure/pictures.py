@@ -50,7 +50,7 @@ def draw_all(
     residual_um = 1e3 * full.residual_mm
     files += [
         write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
-        write_figure(out / "residual.png", _map("height over the fit (um)", axis, residual_um, "RdBu_r", even=True)),
+        write_figure(out / "residual.png", _map("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True)),
         write_figure(out / "slopes.png", _slopes(full, full.map() if figure is None else figure.seen)),
         write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
         write_figure(out / "profile.png", _profile(profile)),
@@ -84,9 +84,9 @@ def _figure(found: MeasuredFigure) -> Figure:
     figure, ((whole, rest), (spectrum, energy)) = sheet(12, 10, 2, 2)
     axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
     radius_mm = found.figure.numbers.radius_of_curvature_mm
-    show_map(whole, f"less the best sphere, R = {radius_mm:.1f} mm (um)", axis, deviation_um, "RdBu_r", even=True)
+    show_map(whole, f"less the best sphere, R = {radius_mm:.1f} mm (µm)", axis, deviation_um, "RdBu_r", even=True)
     asymmetry_um = deviation_um - found.figure.rotational_um
-    show_map(rest, "and less its rotationally invariant part (um)", axis, asymmetry_um, "RdBu_r", even=True)
+    show_map(rest, "and less its rotationally invariant part (µm)", axis, asymmetry_um, "RdBu_r", even=True)
     psd = found.spectrum
     low = np.maximum(psd.density_um2_mm2 - psd.sigma_um2_mm2, psd.density_um2_mm2 / 10)
     spectrum.fill_between(psd.frequency_per_mm, low, psd.density_um2_mm2 + psd.sigma_um2_mm2, alpha=0.3)
@@ -109,8 +109,8 @@ def _uncertainty(bars: ErrorBars) -> Figure:
     """Draw 1 sigma from the set itself and from the geometry, and the budget."""
     figure, (left, middle, right) = sheet(17, 4.8, 1, 3)
     of_noise, of_geometry = bars.maps_um()
-    show_map(left, "1 sigma from this set: noise, film, light (um)", bars.grid.axis_mm, of_noise, "magma")
-    show_map(middle, "1 sigma from the geometry (um)", bars.grid.axis_mm, of_geometry, "magma")
+    show_map(left, "1 sigma from this set: noise, film, light (µm)", bars.grid.axis_mm, of_noise, "magma")
+    show_map(middle, "1 sigma from the geometry (µm)", bars.grid.axis_mm, of_geometry, "magma")
     rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0][:_SHOWN_ROWS][::-1]
     places = np.arange(len(rows))
     right.barh(places + 0.2, [row["height_rms_um"] for row in rows], 0.4, label="height")
@@ -166,7 +166,7 @@ def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
         show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, "RdBu_r", even=True)
     for place, slope, name in ((axes[1, 0], grid.slope_x, "dh/dx"), (axes[1, 1], grid.slope_y, "dh/dy")):
         left = np.where(grid.count > 0, 1e6 * slope, np.nan)
-        show_map(place, f"{name} less the fit (urad)", grid.axis_mm, left, "RdBu_r", even=True)
+        show_map(place, f"{name} less the fit (µrad)", grid.axis_mm, left, "RdBu_r", even=True)
     return figure
 
 
@@ -216,7 +216,7 @@ def _profile(profile: surface.RadialProfile) -> Figure:
     low, mean, high = (1e3 * (row - profile.hencky_mm) for row in (profile.low_mm, profile.mean_mm, profile.high_mm))
     lower.fill_between(profile.radius_mm, low, high, alpha=0.4)
     lower.plot(profile.radius_mm, mean)
-    lower.set(xlabel="radius (mm)", ylabel="less Hencky (um)")
+    lower.set(xlabel="radius (mm)", ylabel="less Hencky (µm)")
     return figure
 
 

@@ -47,10 +47,10 @@ def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rms
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     if pair:
-        show_map(left, "change of height (um)", axis_mm, height_um, "RdBu_r", even=True)
+        show_map(left, "change of height (µm)", axis_mm, height_um, "RdBu_r", even=True)
     else:
         show_map(left, "height (mm)", axis_mm, height_um / 1e3, "viridis")
-    show_map(right, f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+    show_map(right, f"RMSE (µm), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_figure(path, figure)
 
 
@@ -69,9 +69,9 @@ def draw_stability(
         axes = figure.add_subplot(grid[k, 0])
         change = heights_um[:, k] - heights_um[:, k].mean()
         axes.plot(time_s, change, ".-", markersize=3, linewidth=0.7)
-        axes.set(ylabel=f"{name} (um)", xlabel="time (s)" if k == len(points) - 1 else "")
+        axes.set(ylabel=f"{name} (µm)", xlabel="time (s)" if k == len(points) - 1 else "")
     shown = figure.add_subplot(grid[:, 1])
-    show_map(shown, f"SD (um), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
+    show_map(shown, f"SD (µm), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
     for name, (x, y) in points.items():
         shown.plot(x, y, "o", color="white", markeredgecolor="black")
         frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
@@ -86,18 +86,18 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
     axes = figure.subplots()
     for j in 1 + np.argsort(-change[:, 1:].std(axis=0))[:8]:
         axes.plot(time_s, change[:, j], linewidth=0.9, label=f"Z{j + 1}")
-    axes.set(xlabel="time (s)", ylabel="change (um RMS)", title="Zernike terms that move most")
+    axes.set(xlabel="time (s)", ylabel="change (µm RMS)", title="Zernike terms that move most")
     axes.legend(loc="best", ncols=4)
     write_figure(path, figure)
 
 
 def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]) -> None:
-    """Draw, for each lag in s, a pair's change of height beside its RMSE, in um."""
+    """Draw, for each lag in s, a pair's change of height beside its RMSE, in µm."""
     figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
-        show_map(row[0], f"change over {lag_s / 60:g} min (um)", axis_mm, change_um, "RdBu_r", even=True)
-        show_map(row[1], f"RMSE (um), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
+        show_map(row[0], f"change over {lag_s / 60:g} min (µm)", axis_mm, change_um, "RdBu_r", even=True)
+        show_map(row[1], f"RMSE (µm), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_figure(path, figure)
 
 
@@ -139,9 +139,9 @@ def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
     axis = rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always))
     plots = (
         rrb.TimeSeriesView(origin=f"stability/{name}", name=title, axis_x=axis)
-        for name, title in (("points_um", "height at the points (um)"), ("zernike_um", "Zernike terms (um RMS)"))
+        for name, title in (("points_um", "height at the points (µm)"), ("zernike_um", "Zernike terms (µm RMS)"))
     )
-    maps = (rrb.TensorView(origin="stability/sd_um", name="SD (um)"), rrb.TextDocumentView(origin="stability/report"))
+    maps = (rrb.TensorView(origin="stability/sd_um", name="SD (µm)"), rrb.TextDocumentView(origin="stability/report"))
     drawn = [rrb.Spatial2DView(origin=f"stability/pictures/{file.stem}", name=file.stem) for file in pictures]
     columns = (rrb.Vertical(*plots), rrb.Vertical(*maps), rrb.Tabs(*drawn))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)
@@ -152,15 +152,15 @@ def lines_of(table: Mapping[str, Any]) -> list[str]:
     sets, sd_um, rmse_um = table["sets"], table["sd_um"], table["rmse_um"]
     out = [
         f"sets      {sets['used']} of {sets['found']} used, {sets['degraded']} degraded, {sets['bad']} bad",
-        f"SD        mean {sd_um['mean']:.4g} um, largest {sd_um['max']:.4g} um",
+        f"SD        mean {sd_um['mean']:.4g} µm, largest {sd_um['max']:.4g} µm",
     ]
     out += [
-        f"point {name:3s} ({p['x_mm']:.0f}, {p['y_mm']:.0f}) mm: SD {p['sd_um']:.4g} um, "
-        f"peak to peak {p['peak_to_peak_um']:.4g} um"
+        f"point {name:3s} ({p['x_mm']:.0f}, {p['y_mm']:.0f}) mm: SD {p['sd_um']:.4g} µm, "
+        f"peak to peak {p['peak_to_peak_um']:.4g} µm"
         for name, p in table["points"].items()
     ]
     out += [_pair_line(pair) for pair in table["pairs"]]
-    return [*out, f"height    RMSE {rmse_um['mean']:.4g} um, shared by all sets ({table['geometry']['source']})"]
+    return [*out, f"height    RMSE {rmse_um['mean']:.4g} µm, shared by all sets ({table['geometry']['source']})"]
 
 
 def _pair_line(pair: dict[str, Any]) -> str:
@@ -168,4 +168,4 @@ def _pair_line(pair: dict[str, Any]) -> str:
     if not pair["count"]:
         return f"{lag:9s} no pairs"
     change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
-    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} um RMS, RMSE {rmse:.4g} um on average"
+    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} µm RMS, RMSE {rmse:.4g} µm on average"

@@ -239,8 +239,8 @@ def _lines(table: dict[str, Any]) -> list[str]:
     lines.append(f"anchor    light and phases of the bins from {light}")
     if table["usable"]:
         lines.append(
-            f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation {table['sag_sd_um']:.3f} um, "
-            f"1 sigma of a frame {table['sag_sigma_um']:.3f} um"
+            f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation {table['sag_sd_um']:.3f} µm, "
+            f"1 sigma of a frame {table['sag_sigma_um']:.3f} µm"
         )
         lines.append(f"fit       leaves {table['rest_share']:.2%} of the fringes' swing")
     return lines
@@ -289,9 +289,9 @@ def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, res
         middle = np.nanmean(sag_um)
         sag.plot(time_s, sag_um - middle, linewidth=0.8)
         sag.fill_between(time_s, sag_um - middle - sigma_um, sag_um - middle + sigma_um, alpha=0.3)
-        sag.set(title=f"sag less {middle / 1e3:.4f} mm (um), band of 1 sigma")
-    terms.set(title="terms less their means (um RMS)", xlabel="time (s)", ylabel="Noll index")
-    sag.set(xlabel="time (s)", ylabel="um")
+        sag.set(title=f"sag less {middle / 1e3:.4f} mm (µm), band of 1 sigma")
+    terms.set(title="terms less their means (µm RMS)", xlabel="time (s)", ylabel="Noll index")
+    sag.set(xlabel="time (s)", ylabel="µm")
     most = float(np.nanquantile(np.abs(residual_adu), 0.995)) or 1.0
     figure.colorbar(left.imshow(residual_adu, cmap="RdBu_r", vmin=-most, vmax=most), ax=left)
     left.set(title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins")

@@ -181,11 +181,11 @@ def _write(
 def _lines(table: dict[str, Any]) -> list[str]:
     what = "height" if table["against"] is None else "change of height"
     return [
-        f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} um, largest {table['rmse_um']['max']:.4g} um "
+        f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest {table['rmse_um']['max']:.4g} µm "
         f"({table['trials']} trials, seed {table['seed']})",
-        f"linear      mean {table['linear_um']['mean']:.4g} um, largest {table['linear_um']['max']:.4g} um",
-        f"noise alone mean {table['noise_um']['mean']:.4g} um, largest {table['noise_um']['max']:.4g} um",
-        f"sag         1 sigma {table['sag_sigma_um']:.4g} um",
-        f"budget      mean {table['budget_um']['mean']:.4g} um, largest {table['budget_um']['max']:.4g} um: "
+        f"linear      mean {table['linear_um']['mean']:.4g} µm, largest {table['linear_um']['max']:.4g} µm",
+        f"noise alone mean {table['noise_um']['mean']:.4g} µm, largest {table['noise_um']['max']:.4g} µm",
+        f"sag         1 sigma {table['sag_sigma_um']:.4g} µm",
+        f"budget      mean {table['budget_um']['mean']:.4g} µm, largest {table['budget_um']['max']:.4g} µm: "
         "also film, light, blur and slopes left of each set",
     ]

@@ -22,7 +22,7 @@ from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
 _MANY_BLAMED = 3
-# Below, the light is called even: it leaves 0.02 um in the figure, and a blurred set seems to differ by as much.
+# Below, the light is called even: it leaves 0.02 µm in the figure, and a blurred set seems to differ by as much.
 _UNEVEN = 2e-3
 _BLURRED_RAD = 2.0  # from the pattern's edge: a blurred picture of it says nothing of a frame's light
 _LIGHT_KNOWN = 3e-4  # what another round would change, once it is not even

@@ -280,7 +280,7 @@ def _film(bench: TrialBench, spread: GeometrySpread, film: FilmMotion) -> tuple[
     noise = replace(budget.film_source(bench, (moved.noise_um,), says, paired=False), name="film_seen_um")
     if not moved.sure:
         return [source, noise], []
-    says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} um from the x to the y frames"
+    says = f"the film moved by {moved.moved_um:+.0f} +- {moved.sigma_um:.0f} µm from the x to the y frames"
     return [source, noise], [f"{says}, seen in the fringes: record the laser's readings"]
 
 

@@ -34,7 +34,7 @@ _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
 _TIMES_SEEN = np.logspace(0, 2.5, 12)  # sizes of the common misfit: never below that of the terms without a law
 # Powers of the sag with which a misfit grows: a ring's figure stays, what a law leaves of large strains grows by 3
 _GROWTHS = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0])
-_NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 um at 37 mm
+_NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 µm at 37 mm
 _UNLIKE = 1.0  # misfit over that of the terms without a law: natural logarithm, of a Cauchy distribution
 _SURE = 4.0  # sigmas
 _NODES = _ITERATIONS = 40

@@ -16,7 +16,7 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
-_STILL_UM = 0.2  # standard deviation of the film's place: less is hardly seen, and leaves 0.06 um in the figure
+_STILL_UM = 0.2  # standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
 # motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
 X_TO_Y = 5.0
 _START_SAG_MM = 40.0  # the paper's starting parabola

@@ -163,7 +163,7 @@ class LiveReconstructor:
         return np.asarray(1e6 * to_coeffs @ self._watch.common_mm2 @ to_coeffs.T)
 
     def sag_sensitivity(self) -> FloatArray:
-        """Change of the coefficients (terms,) in um per um of sag of a Hencky bowl."""
+        """Change of the coefficients (terms,) in µm per µm of sag of a Hencky bowl."""
         return film_law.zernike_projection().copy()
 
     def _tracer(self, readings_um: FloatArray) -> reconstruct.Tracer:

@@ -46,8 +46,8 @@ def combine_steps(
 def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
     """Whether the readings show motion beyond the laser's noise.
 
-    A swing of 1 um standard deviation left in the frames costs 0.3 um RMS of figure; correcting with 1 um of pure
-    noise costs 0.12 um (both measured on the twin). Above 1.5 times the noise nearly all of it is motion.
+    A swing of 1 µm standard deviation left in the frames costs 0.3 µm RMS of figure; correcting with 1 µm of pure
+    noise costs 0.12 µm (both measured on the twin). Above 1.5 times the noise nearly all of it is motion.
     """
     return bool(np.all(np.isfinite(displacement_um)) and np.std(displacement_um) > 1.5 * noise_um)
 
@@ -55,7 +55,7 @@ def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
 def sensitivity_mm_per_um(
     tracer: reconstruct.Tracer, points: reconstruct.Points, surface: Surface, step_um: float = 10.0
 ) -> FloatArray:
-    """Change (2, n) of the screen points per um of displacement, by a central difference of the traced model.
+    """Change (2, n) of the screen points per µm of displacement, by a central difference of the traced model.
 
     The bowl's sag grows by the displacement and its vertex moves towards -z, so that the ring stays where it is.
     """
@@ -86,7 +86,7 @@ class TrackedPoints:
     points: reconstruct.Points  # rays, screen points, weights
     # (2, n): subtracted from T phi / (2 pi): the phase at O', and what averaging over a bin adds
     offset_mm: FloatArray
-    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
+    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per µm of displacement
     area_mm2: FloatArray  # (n,): area of the mirror that a bin sees
     surface: Surface  # last solution
     normal: reconstruct.NormalMatrix

@@ -253,7 +253,7 @@ def track(
     combined : two StepCombination
         How the frames of each axis combine.
     sensitivity_rad_per_um : (2, n) array
-        Change of phase per um of displacement.
+        Change of phase per µm of displacement.
     last, out : (2, FOLLOWED_ROWS, n) arrays
         Rows of the cycle before, from which the change is counted (unambiguous below pi), and of this one.
     """

@@ -8,7 +8,7 @@ from membrane_ctrl.model.event_base import EventLine as EventLine
 from membrane_ctrl.model.event_base import LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Notice, NoticeChanges, NoticeKey, Notices, Topic
 
-_COMMAND_UNITS = {"setpoint": "um", "manual": "um/s", "gains": "s on trial"}  # of a command's value
+_COMMAND_UNITS = {"setpoint": "µm", "manual": "µm/s", "gains": "s on trial"}  # of a command's value
 _COMMAND_MARKS = {"setpoint": "setpoint", "pause": "pause", "resume": "pause", "mark": "mark"}  # others: "command"
 
 

@@ -167,7 +167,7 @@ def judge(quality: Quality) -> tuple[Verdict, str]:
         (q.saturated_fraction <= SATURATED_REJECTED_FRACTION, f"{q.saturated_fraction:.1%} of the points saturated"),
         (q.valid_fraction >= VALID_REJECTED_FRACTION, f"only {q.valid_fraction:.0%} of the area gave a slope"),
         (q.converged, "the fit did not converge"),
-        (q.residual_urad <= RESIDUAL_REJECTED_URAD, f"slope residual {q.residual_urad:.0f} urad"),
+        (q.residual_urad <= RESIDUAL_REJECTED_URAD, f"slope residual {q.residual_urad:.0f} µrad"),
     )
     degraded = (
         (q.modulation_share >= MODULATION_DEGRADED_SHARE, rejected[0][1]),

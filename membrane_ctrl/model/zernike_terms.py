@@ -36,5 +36,5 @@ def zernike_labels(first: int = 1) -> list[str]:
 
 
 def zernike_columns() -> list[str]:
-    """Return the names of a table's columns with one term each, in um: `z1_um`, `z2_um`, ..."""
+    """Return the names of a table's columns with one term each, in µm: `z1_um`, `z2_um`, ..."""
     return [f"z{j}_um" for j in NOLL_INDICES]

@@ -72,7 +72,7 @@ def _error(config: Config) -> rrb.TimeSeriesView:
 
 
 def _around_band(config: Config, name: str, *paths: str) -> rrb.TimeSeriesView:
-    """Plot over twice the band: the start, tens of um off, would make the hold invisible."""
+    """Plot over twice the band: the start, tens of µm off, would make the hold invisible."""
     band_um = config.limits.band_um
     return _plot(name, "/loop/band", *paths, span=(-2 * band_um, 2 * band_um), marks=True)
 

@@ -187,7 +187,7 @@ WATERFALL_LEAST_UM = 0.05
 # Colours span nearly all of a map: a few pixels at the edge must not hide the rest.
 _NEARLY_ALL = 0.99
 # Zernike terms removed from the maps of change (the mount tilts, the loop holds the bowl's depth), and the least span
-# of their colours, um: noise must not look like a figure.
+# of their colours, µm: noise must not look like a figure.
 CHANGES = {"difference": (0, 0.5), "difference_no_tilt": (3, 0.5), "difference_no_defocus": (4, 0.1)}
 
 

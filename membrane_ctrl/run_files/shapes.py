@@ -64,7 +64,7 @@ class Shapes:
         return {"time_s": self.time_s} | coeffs | numbers | {"verdict": self.verdict}
 
     def heights_um(self, x: Column, y: Column) -> Column:
-        """(n, points) height above the vertex at points of the unit disc (mirror radius 1), um."""
+        """(n, points) height above the vertex at points of the unit disc (mirror radius 1), µm."""
         return self.parameters_um() @ height_basis(x, y)
 
     def parameters_um(self) -> Column:
@@ -72,7 +72,7 @@ class Shapes:
         return np.column_stack((self.coeffs_um, self.hencky_um))
 
     def covariance_near(self, time_s: float) -> Column | None:
-        """Covariance (terms, terms) in um^2 recorded nearest to a time; None if there is none."""
+        """Covariance (terms, terms) in µm^2 recorded nearest to a time; None if there is none."""
         if not self.covariance_time_s.size:
             return None
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
@@ -189,18 +189,18 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
 
 
 def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> Map:
-    """Height minus that of the reference, each above its own vertex; um, as `height_map_mm`."""
+    """Height minus that of the reference, each above its own vertex; µm, as `height_map_mm`."""
     change_um = estimate.coeffs_um - reference.coeffs_um
     return change_map_um(np.append(change_um, estimate.hencky_um - reference.hencky_um))
 
 
 def change_map_um(parameters_um: Column) -> Map:
-    """Height of a change of the parameters (`Shapes.parameters_um`), um, as `height_map_mm`."""
+    """Height of a change of the parameters (`Shapes.parameters_um`), µm, as `height_map_mm`."""
     return _spread(parameters_um @ _basis())
 
 
 def deviation_map_um(parameters_um: Column) -> Map:
-    """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters, um."""
+    """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters, µm."""
     variance = np.einsum("jp,jp->p", _basis(), np.cov(parameters_um.T) @ _basis())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -219,7 +219,7 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
 
 
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
-    """Standard deviation of the height, um: sqrt of z C z' with the row z of the terms at each point."""
+    """Standard deviation of the height, µm: sqrt of z C z' with the row z of the terms at each point."""
     variance = np.einsum("jp,jp->p", _terms(), covariance_um2 @ _terms())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -240,7 +240,7 @@ class Scatter:
         self._squares += np.outer(off, coeffs_um - self._mean)
 
     def map_um(self) -> Map:
-        """Standard deviation of the height, um; zero for one cycle."""
+        """Standard deviation of the height, µm; zero for one cycle."""
         return uncertainty_map_um(self._squares / max(self.count - 1, 1))
 
 

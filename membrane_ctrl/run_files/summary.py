@@ -142,7 +142,7 @@ class SecondMeans:
 
 SCHEMA = "membrane-summary/2"
 
-# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 um steps.
+# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 µm steps.
 ARRIVED_UM = 0.01
 # Limits on listed transitions and faults; their counters continue (a device may flicker for a week).
 _LISTED_MAX = 1000

@@ -230,7 +230,7 @@ class TwinProcess:
         return cls(config.model_copy(update={"devices": devices}), truth)
 
     def truth_reader(self) -> Callable[[], tuple[float, float]]:
-        """A function that returns the newest true displacement and laser bias, in um."""
+        """A function that returns the newest true displacement and laser bias, in µm."""
         reader = ring.RingReader(self.truth)
 
         def newest() -> tuple[float, float]:

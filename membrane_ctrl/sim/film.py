@@ -184,9 +184,9 @@ NOMINAL_SAG_MM = float(MIRROR_FILM.sag_mm_per_root_pa(SETTLED_S)) * NOMINAL_PRES
 # counts them: one mL is always the same number of molecules.
 
 STANDARD_AMBIENT_PA = 101_325.0
-REFERENCE_K = 296.15  # 23 deg C, the standard laboratory atmosphere (ISO 291); 123 um/K holds there
+REFERENCE_K = 296.15  # 23 deg C, the standard laboratory atmosphere (ISO 291); 123 µm/K holds there
 JOULE_PER_ML = (STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA) * 1e-6  # P V of a reference mL at 23 deg C
-GAS_FOLLOWS_AIR_S = 12.0  # through 10 um of PET (docs/physics.md, estimate)
+GAS_FOLLOWS_AIR_S = 12.0  # through 10 µm of PET (docs/physics.md, estimate)
 
 
 @dataclass(slots=True)

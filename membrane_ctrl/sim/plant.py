@@ -55,7 +55,7 @@ _STRUCT = struct.Struct(f"<{len(fields(Truth))}d")
 TRUTH_BYTES = _STRUCT.size
 
 
-GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 um of centre, so a monitor only
+GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 µm of centre, so a monitor only
 LASER_GOOD = 0
 LASER_NO_LIGHT = 1
 

@@ -121,7 +121,7 @@ def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) ->
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in (
-            ("run", "run"), ("started", "started"), ("hours", "h"), ("std", "std, um"), ("faults", "faults"),
+            ("run", "run"), ("started", "started"), ("hours", "h"), ("std", "std, µm"), ("faults", "faults"),
             ("exit", "end"), ("marks", "marks"), ("error", "error"),
         )
     ]  # fmt: skip

@@ -50,7 +50,7 @@ def test_the_correction_leaves_the_rounding_of_levels() -> None:
     response = measured_response(RAMP_LEVELS, power_law(2.2))
     bare, corrected = (fringe_error_mm(response, PatternConfig(), linear) for linear in (False, True))
     assert corrected < 0.5 * bare
-    assert 1e3 * corrected == pytest.approx(20, abs=2)  # um: the rounding to 256 levels, which bins average away
+    assert 1e3 * corrected == pytest.approx(20, abs=2)  # µm: the rounding to 256 levels, which bins average away
 
 
 def test_a_configuration_without_a_screen_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

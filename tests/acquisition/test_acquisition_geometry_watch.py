@@ -51,7 +51,7 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
         told += [event for _ in range(CYCLES) if (event := drift.after(cycle)) is not None]
     assert [event.kind for event in told] == ["maintenance", "maintenance_over"]
     assert {event.name for event in told} == {"calibrate"}
-    assert told[0].message.startswith("calibrate again: the fit leaves 4.50 urad")
+    assert told[0].message.startswith("calibrate again: the fit leaves 4.50 µrad")
 
 
 def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
@@ -59,15 +59,15 @@ def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
     deeper = replace(CYCLE, coeffs_um=CYCLE.coeffs_um + 2000.0 * zernike_projection())
     assert not any(drift.after(deeper) for _ in range(CYCLES))
     tilted = CYCLE.coeffs_um.copy()
-    tilted[1] += 4.0  # 2 x of the radius a unit: 8 um at the rim, 5.7 um RMS around it
+    tilted[1] += 4.0  # 2 x of the radius a unit: 8 µm at the rim, 5.7 µm RMS around it
     told = [event for _ in range(CYCLES) if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None]
     assert [event.name for event in told] == ["calibrate"]
-    assert "the ring is seen 5.7 um RMS from where it was" in told[0].message
+    assert "the ring is seen 5.7 µm RMS from where it was" in told[0].message
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
     weak = LiveDrift(in_force(), 4)
-    # 2.83 urad of film, and 1.5 urad of noise that was 1.0 at the calibration and grows as the light fades
+    # 2.83 µrad of film, and 1.5 µrad of noise that was 1.0 at the calibration and grows as the light fades
     faded = replace(CYCLE, modulation_median_adu=4.0)
     noise_urad = weak.noise_urad(faded)
     assert noise_urad == pytest.approx(20 * weak.noise_urad(CYCLE))

@@ -45,7 +45,7 @@ def laser(address: RingAddress) -> Iterator[LaserHistory]:
 
 def test_mean_of_the_readings_around_a_moment(telemetry: RingWriter, laser: LaserHistory) -> None:
     for k in range(100):
-        telemetry.put(row(k * 0.02, k * 0.02 * 3.0, k))  # 3 um/s
+        telemetry.put(row(k * 0.02, k * 0.02 * 3.0, k))  # 3 µm/s
     assert laser.at(1.01) == pytest.approx(3.03)  # a steady motion cancels in a symmetric window
     assert laser.at(0.51) == pytest.approx(1.53)  # and older moments are still available
 

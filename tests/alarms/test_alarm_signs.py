@@ -72,7 +72,7 @@ def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]
     [("laser", "the laser is wrong"), ("optics", "the camera is wrong"), ("unknown", "disagree (laser")],
 )
 def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, says: str) -> None:
-    line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 um, camera +0.1 um"}
+    line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 µm, camera +0.1 µm"}
     (sign,) = signs_of(from_dict(line).notice_changes({}))
     assert says in sign.text
     assert "laser +20.0 µm" in sign.text

@@ -35,7 +35,7 @@ lateness_max_ms = 1900.0
 
 
 async def _held(kind: str, folder: Path) -> tuple[dict[str, Any], list[float]]:
-    """The summary of a hold, and the true displacements once settled (um)."""
+    """The summary of a hold, and the true displacements once settled (µm)."""
     (folder / kind).mkdir()
     bench = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "tests.board.film_bench", kind, str(folder / kind), stdout=asyncio.subprocess.PIPE
@@ -68,6 +68,6 @@ async def test_the_mirror_is_held_as_well_as_through_the_python_board(tmp_path: 
         return
     other, other_um = await _held("python", tmp_path)
     found, wanted = pstdev(truth_um), pstdev(other_um)
-    print(f"true standard deviation: C board {found:.4f} um, Python board {wanted:.4f} um")
+    print(f"true standard deviation: C board {found:.4f} µm, Python board {wanted:.4f} µm")
     print(f"readings: {summary['held']} and {other['held']}")
     assert abs(found - wanted) < 0.1 * wanted

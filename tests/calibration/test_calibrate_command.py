@@ -165,7 +165,7 @@ def test_a_set_with_a_bad_frame_is_used_with_a_word(
 
 def test_one_pressure_is_not_enough(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", str(folders[0]), "--out", str(tmp_path / "g.toml"), "--json"]) == 3
-    assert "only 0 um apart" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
+    assert "only 0 µm apart" in json.loads(capsys.readouterr().out)["findings"][0]["says"]
 
 
 def test_sets_of_different_rigs_are_named(
@@ -209,7 +209,7 @@ def test_the_report_notes_sets_that_state_different_references(
     )
     run(["calibrate", str(folders[2]), str(other), "--out", str(tmp_path / "geometry.toml")])
     said = capsys.readouterr()
-    assert "the sets state reference_displacement_um from -4000 to 0 um" in said.out + said.err
+    assert "the sets state reference_displacement_um from -4000 to 0 µm" in said.out + said.err
     run(["calibrate", str(folders[2]), str(folders[0]), "--out", str(tmp_path / "geometry.toml")])
     said = capsys.readouterr()
     assert "the sets state" not in said.out + said.err
@@ -390,7 +390,7 @@ def test_a_film_that_moves_within_its_sets_calibrates(tmp_path: Path, capsys: py
     assert run(words) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["findings"] == []
-    # the fringes see the steps of one axis; the laser's noise of 1 um leaves ripples of up to five times the noise
+    # the fringes see the steps of one axis; the laser's noise of 1 µm leaves ripples of up to five times the noise
     assert all(row["noise_ratio"] < 1.5 for row in report["sets"])
     found = {row["name"]: row for row in report["parameters"]}
     assert abs(found["alpha_deg"]["value"] - 0.3) < 4 * found["alpha_deg"]["sigma"] < 0.08

@@ -63,7 +63,7 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     answer(monkeypatch, "y\n")
     assert run([*live, "--range-um", "4000", "--sets", "3"]) == 130
     said = capsys.readouterr().err
-    assert "3 of 3 sets from -2000 to 2000 um" in said
+    assert "3 of 3 sets from -2000 to 2000 µm" in said
     assert "a figure after these sets: sag +-" in said
     assert "limits.gauge_pressure_max_pa allow" in said
     session = session_in(tmp_path)
@@ -141,7 +141,7 @@ def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(
     bench.interrupts_again = True
     assert run([*live, "--range-um", "1000", "--sets", "2", "--yes"]) == 130
     said = capsys.readouterr().err
-    assert "left: the hold continues its ramp to 0 um; then switch the shape loop on" in said
+    assert "left: the hold continues its ramp to 0 µm; then switch the shape loop on" in said
     assert bench.hold.rows[-1].target_um == 0.0
     assert bench.hold.rows[-1].displacement_um < -100.0
 
@@ -153,7 +153,7 @@ def test_setpoints_that_are_out_of_reach_now_are_refused(
     assert run([*live, "--range-um", "2000", "--sets", "2", "--yes"]) == 3
     bench.config = config(displacement_max_um=500.0)
     assert run([*live, "--session", str(session_in(tmp_path)), "--yes"]) == 2
-    assert "the sets from -1000 to 1000 um are beyond -4440 to 440" in capsys.readouterr().err
+    assert "the sets from -1000 to 1000 µm are beyond -4440 to 440" in capsys.readouterr().err
 
 
 def test_nothing_moves_unless_somebody_says_yes(
@@ -186,7 +186,7 @@ def test_somebody_elses_setpoint_ends_it(
 ) -> None:
     bench.meddles_at = 3  # after the setpoint of the first set
     assert run([*live, "--range-um", "1000", "--yes"]) == 4
-    assert "someone else moved the setpoint to 77 um" in capsys.readouterr().err
+    assert "someone else moved the setpoint to 77 µm" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

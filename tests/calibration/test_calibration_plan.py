@@ -44,10 +44,10 @@ def test_the_range_is_moved_into_the_reach_and_the_nearer_end_comes_first() -> N
 @pytest.mark.parametrize(
     ("reach", "range_um", "says"),
     [
-        (WIDE, 10_001.0, "low and high leave 10000 um"),
-        (WIDE, 999.0, "closer together than 1000 um add nothing to one set"),
-        (Reach(-300.0, 300.0, "low", "high"), None, "low and high leave 600 um: sets closer together than 1000 um"),
-        (Reach(300.0, -300.0, "low", "high"), None, "leave 0 um"),
+        (WIDE, 10_001.0, "low and high leave 10000 µm"),
+        (WIDE, 999.0, "closer together than 1000 µm add nothing to one set"),
+        (Reach(-300.0, 300.0, "low", "high"), None, "low and high leave 600 µm: sets closer together than 1000 µm"),
+        (Reach(300.0, -300.0, "low", "high"), None, "leave 0 µm"),
     ],
 )
 def test_no_room(reach: Reach, range_um: float | None, says: str) -> None:

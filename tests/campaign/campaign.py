@@ -178,7 +178,7 @@ def document(results: list[Result], told: list[Told]) -> str:
 
 _INVARIANTS = (
     "- The true sag and pressure stay within the limits as long as their sensor reads true. Without a laser the "
-    "bowl goes no further than 40 um. The pressure always stays below the board's own limit. After a run has "
+    "bowl goes no further than 40 µm. The pressure always stays below the board's own limit. After a run has "
     "ended, only the board bounds a pump that runs on although its read-back says 0.",
     "- The drive of the pump's motor is 0 in standby and on the way down, at and below PUMP_OFF, 14 s after the "
     "last laser reading (8 s of mean flow, 6 s of ramp), after the vent was opened, and after the end of the run; "

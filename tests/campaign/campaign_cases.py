@@ -126,9 +126,9 @@ CASES: tuple[Case, ...] = (
         moving=Reaction(SafeLevel.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of the used budget recover
     ),
     _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
-    _case("laser 20 um off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
+    _case("laser 20 µm off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
     _case(
-        "laser 200 um off",
+        "laser 200 µm off",
         f"{_LOST} displacement_jump following_error over_displacement under_displacement over_pressure actuator_test "
         "laser_gauge_apart",
         wrong={"laser_offset_um": -200},
@@ -137,7 +137,7 @@ CASES: tuple[Case, ...] = (
         moving=Reaction(SafeLevel.HOLD_FLOW, 8 * TICK_S),
     ),
     _case(
-        "laser 600 um too deep",
+        "laser 600 µm too deep",
         "over_displacement",
         wrong={"laser_offset_um": 600},
         laser_lies=True,
@@ -277,7 +277,7 @@ CASES: tuple[Case, ...] = (
     _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
     _case("control code raises", "tick_error", raises=True, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
     _case("camera lost", wrong={"camera_lost": 1}),
-    _case("camera sees 30 um too much", wrong={"camera_offset_um": 30.0}),
+    _case("camera sees 30 µm too much", wrong={"camera_offset_um": 30.0}),
     _case("leak ten times", "following_error under_displacement actuator_test", leak_factor=10.0),
     _case("door, 20 Pa", "actuator_test", door_pa=20.0),
     _case("storm, 250 Pa at once", f"{_LOST} displacement_jump following_error under_displacement", door_pa=250.0),

@@ -277,7 +277,7 @@ async def a_laser_is_unplugged() -> list[str]:
         before_um = lab.now().truth().displacement_um
         await rig.wait(HOLD_FLOW_S + RAMP_S + 1.0)
         went_um = lab.now().truth().displacement_um - before_um
-        rig.must(went_um < 30.0, f"blind, and the bowl went {went_um:.0f} um deeper")
+        rig.must(went_um < 30.0, f"blind, and the bowl went {went_um:.0f} µm deeper")
         await rig.wait(5.0, rig.still)
 
     return await _both(story)

@@ -193,7 +193,7 @@ def _begins_s(config: Config, world: World, at: Situation) -> float:
 
 
 def relay_about(flow_um_per_s: float) -> ExperimentSpec:
-    """An experiment that swings the mirror by some um."""
+    """An experiment that swings the mirror by some µm."""
     return ExperimentSpec(
         kind="relay", duration_s=40.0, limit_um=8.0, holding_flow_um_per_s=flow_um_per_s, laser_um=1.0
     )

@@ -25,7 +25,7 @@ def a_clock_that_stands() -> list[str]:
     before_um = stage.plant.truth().displacement_um
     stage.wait(12.0)
     went_um = stage.plant.truth().displacement_um - before_um
-    stage.must(abs(went_um) < 10.0, f"followed samples of the past by {went_um:.0f} um")
+    stage.must(abs(went_um) < 10.0, f"followed samples of the past by {went_um:.0f} µm")
     stage.wait(15.0)
     stage.wait(5.0, stage.still)
     return stage.violations
@@ -38,7 +38,7 @@ def a_laser_that_doubts_itself() -> list[str]:
     before_um = stage.plant.truth().displacement_um
     stage.wait(7.0)
     went_um = stage.plant.truth().displacement_um - before_um
-    stage.must(abs(went_um) < 10.0, f"followed a reading of bad quality by {went_um:.0f} um")
+    stage.must(abs(went_um) < 10.0, f"followed a reading of bad quality by {went_um:.0f} µm")
     stage.wait(10.0)
     stage.wait(5.0, stage.still)
     return stage.violations
@@ -71,13 +71,13 @@ def creeping(stage: Stage, um_per_s: float, deepest_um: float) -> Callable[[], s
     def creep() -> str:
         stage.bench.wrong.laser_offset_um -= um_per_s * TICK_S
         deep_um = stage.plant.truth().displacement_um
-        return f"the bowl followed the laser to {deep_um:.0f} um" if deep_um > deepest_um else ""
+        return f"the bowl followed the laser to {deep_um:.0f} µm" if deep_um > deepest_um else ""
 
     return creep
 
 
 def a_creeping_laser() -> list[str]:
-    """The laser's mount starts to drift at 0.5 um/s; camera and gauge detect it."""
+    """The laser's mount starts to drift at 0.5 µm/s; camera and gauge detect it."""
     stage = Stage(camera=True).held()
     stage.wait(60.0)
     stage.wait(150.0, creeping(stage, 0.5, DISPLACEMENT_MAX_UM))
@@ -85,7 +85,7 @@ def a_creeping_laser() -> list[str]:
 
 
 def a_stuck_gauge_and_a_creeping_laser() -> list[str]:
-    """No camera; the gauge freezes, then the laser's mount starts to drift at 2 um/s."""
+    """No camera; the gauge freezes, then the laser's mount starts to drift at 2 µm/s."""
     stage = Stage().held()
     stage.wait(10.0)
     stage.bench.wrong.gauge_stuck = True
@@ -95,7 +95,7 @@ def a_stuck_gauge_and_a_creeping_laser() -> list[str]:
 
 
 def a_creeping_laser_without_a_camera() -> list[str]:
-    """The laser's mount starts to drift at 1 um/s; the gauge alone detects it."""
+    """The laser's mount starts to drift at 1 µm/s; the gauge alone detects it."""
     stage = Stage().held()
     stage.wait(60.0)
     stage.wait(300.0, creeping(stage, 1.0, 70.0))
@@ -128,7 +128,7 @@ def a_camera_lost_on_a_bench_without_a_laser() -> list[str]:
     before_um = stage.plant.truth().displacement_um
     stage.wait(8.0)
     went_um = stage.plant.truth().displacement_um - before_um
-    stage.must(abs(went_um) < 10.0, f"went {went_um:.0f} um without a figure")
+    stage.must(abs(went_um) < 10.0, f"went {went_um:.0f} µm without a figure")
     stage.until(State.FAULT, 6.0)
     stage.wait(8.0)
     stage.wait(5.0, stage.still)
@@ -136,14 +136,14 @@ def a_camera_lost_on_a_bench_without_a_laser() -> list[str]:
 
 
 def optics_that_creep_without_a_laser() -> list[str]:
-    """The stand sinks and the sag seems to shrink by 1 um/s; the gauge alone detects it."""
+    """The stand sinks and the sag seems to shrink by 1 µm/s; the gauge alone detects it."""
     stage = by_optics()
     stage.wait(60.0)
 
     def creep() -> str:
         stage.bench.wrong.camera_offset_um -= TICK_S
         deep_um = stage.plant.truth().displacement_um
-        return f"the bowl followed the optics to {deep_um:.0f} um" if deep_um > 70.0 else ""
+        return f"the bowl followed the optics to {deep_um:.0f} µm" if deep_um > 70.0 else ""
 
     stage.wait(300.0, creep)
     stage.wait(5.0, stage.still)
@@ -161,7 +161,7 @@ def a_seam_that_opens() -> list[str]:
 
 
 def a_setpoint_is_reached() -> list[str]:
-    """A setpoint 15 um higher moves the true mirror by 15 um, and the gauge shows the true pressure."""
+    """A setpoint 15 µm higher moves the true mirror by 15 µm, and the gauge shows the true pressure."""
     stage = Stage(camera=True).held()
     stage.ask("setpoint", value=15.0)
     stage.wait(40.0)
@@ -193,7 +193,7 @@ def a_fill_that_leaks_ends() -> list[str]:
     stage = Stage(config=config.model_copy(update={"states": timed}))
     stage.ask("hold")
     stage.until(State.INFLATE)
-    stage.bench.wrong.vent_stuck_fraction = 0.08  # 8 um/s: more than the pump has
+    stage.bench.wrong.vent_stuck_fraction = 0.08  # 8 µm/s: more than the pump has
     stage.wait(60.0)
     stage.wait(20.0, stage.still)
     stage.must(stage.state == State.FAULT, "a fill without an end")

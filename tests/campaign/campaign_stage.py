@@ -87,7 +87,7 @@ class Stage:
     def near(self, target_um: float = 0.0, within_um: float = 10.0) -> None:
         """The mirror is where it should be."""
         off_um = self.plant.truth().displacement_um - target_um
-        self.must(abs(off_um) < within_um, f"the mirror is {off_um:.1f} um off")
+        self.must(abs(off_um) < within_um, f"the mirror is {off_um:.1f} µm off")
 
 
 Change = Callable[[BoardSample], BoardSample]

@@ -187,7 +187,7 @@ def orders_beyond_the_limits() -> list[str]:
     for value in (math.nan, math.inf, -1.0, 1e6):
         stage.ask("manual", value=value)
         stage.wait(4.0)
-        stage.must(stage.state == State.HOLD, f"manual with {value:g} um/s was taken")
+        stage.must(stage.state == State.HOLD, f"manual with {value:g} µm/s was taken")
         stage.near()
     return stage.violations
 
@@ -212,7 +212,7 @@ def manual_has_an_end() -> list[str]:
 
         def far(at: Stage = stage) -> str:
             way_um = at.plant.truth().displacement_um
-            return f"in manual, and the mirror went {way_um:.0f} um" if abs(way_um) > 30.0 else ""
+            return f"in manual, and the mirror went {way_um:.0f} µm" if abs(way_um) > 30.0 else ""
 
         stage.wait(150.0, far)
         stage.must(stage.state == State.HOLD, "the operator has left, and nobody holds the mirror")
@@ -230,7 +230,7 @@ def manual_without_light() -> list[str]:
     before_um = stage.plant.truth().displacement_um
     stage.wait(10.0)
     went_um = stage.plant.truth().displacement_um - before_um
-    stage.must(went_um < 12.0, f"blind in manual, and the bowl went {went_um:.0f} um deeper")
+    stage.must(went_um < 12.0, f"blind in manual, and the bowl went {went_um:.0f} µm deeper")
     return stage.violations
 
 

@@ -26,7 +26,7 @@ VENTS_AFTER_S = {
     SafeLevel.PUMP_OFF: PUMP_OFF_S,
     SafeLevel.VENT: 0.0,
 }
-# limits near the setpoint, so that a run of a minute can reach them: 40 um are 2 Pa, the gauge's noise is 0.5 Pa
+# limits near the setpoint, so that a run of a minute can reach them: 40 µm are 2 Pa, the gauge's noise is 0.5 Pa
 DISPLACEMENT_MIN_UM, DISPLACEMENT_MAX_UM = -80.0, 40.0
 FOLLOWING_ERROR_MAX_UM = 25.0
 GAUGE_MARGIN_PA = 5.0  # over the pressure at which the mirror is held

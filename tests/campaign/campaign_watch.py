@@ -108,7 +108,7 @@ class Watch:
         if self._case.harmless and self._at.held and not self._case.lies:
             off_um = self._plant.truth().displacement_um - self._at.target_um
             if abs(off_um) > _HELD_UM:
-                self._say(now_s, f"the mirror is {off_um:.1f} um from its setpoint")
+                self._say(now_s, f"the mirror is {off_um:.1f} µm from its setpoint")
         if self._state_then == State.FAULT:
             return  # the first cause is another one, and stays
         said = self.names.get(self.code, f"code {self.code:g}")
@@ -227,13 +227,13 @@ class Watch:
         blind = wrong.no_light or wrong.silent or wrong.unreachable
         seen = not blind and not case.laser_lies and math.isnan(wrong.vent_stuck_fraction)
         if seen and truth.displacement_um > DISPLACEMENT_MAX_UM + _OVERSHOOT_UM and self._plant.vent_given < 1:
-            self._say(now_s, f"the bowl is at {truth.displacement_um:.1f} um and the vent is shut")
+            self._say(now_s, f"the bowl is at {truth.displacement_um:.1f} µm and the vent is shut")
         if not blind:
             self._blind_s = math.nan
         elif math.isnan(self._blind_s):
             self._blind_s, self._blind_um = now_s, truth.displacement_um
         elif self._obeys and case.door_pa == 0 and truth.displacement_um > self._blind_um + _BLIND_UM:
-            self._say(now_s, f"blind, and the bowl went from {self._blind_um:.1f} to {truth.displacement_um:.1f} um")
+            self._say(now_s, f"blind, and the bowl went from {self._blind_um:.1f} to {truth.displacement_um:.1f} µm")
 
     def _look_at_the_way_down(self, now_s: float) -> None:
         """The pump is off where it must be, stops in time, and the vent opens in time."""

@@ -133,7 +133,7 @@ class HoldRig:
     def near(self) -> None:
         """The mirror is at its setpoint."""
         off_um = self.plant.truth().displacement_um
-        self.must(abs(off_um) < 10.0, f"the mirror is {off_um:.1f} um off")
+        self.must(abs(off_um) < 10.0, f"the mirror is {off_um:.1f} µm off")
 
     def ask(self, *kinds: str) -> None:
         """Commands for the next tick."""

@@ -47,11 +47,11 @@ class Undertaking(Enum):
 
     INFLATE = "inflate"
     HOLD = "hold"
-    SETPOINT = "hold, setpoint 40 um up"
+    SETPOINT = "hold, setpoint 40 µm up"
     GAINS = "hold, gains on trial"
     CURVE = "hold, pump curve on trial"
     PAUSE = "pause"
-    MANUAL_UP = "manual, 5 um/s"
+    MANUAL_UP = "manual, 5 µm/s"
     MANUAL_OFF = "manual, no flow"
     RELAY = "tune relay"
     STEPS = "tune steps"
@@ -66,7 +66,7 @@ class Undertaking(Enum):
         return Activity(word)
 
 
-# How far an undertaking itself moves the mirror up; displacement 0 of the optics is up to 12 um above the start.
+# How far an undertaking itself moves the mirror up; displacement 0 of the optics is up to 12 µm above the start.
 WAYS_UM = {Undertaking.INFLATE: 17.0, Undertaking.SETPOINT: 40.0}
 
 
@@ -123,17 +123,17 @@ def _kind_of_drift(um_per_s: float) -> Failure:
 
 
 def _common(sensor: FilmSensor, unit: float, noise: float) -> Iterator[SensorFailure]:
-    """Failures of any sensor of the film; `unit` is its unit in um of the centre, `noise` that of a reading."""
+    """Failures of any sensor of the film; `unit` is its unit in µm of the centre, `noise` that of a reading."""
     yield SensorFailure(sensor, "lost", Failure.LOST, lost)
     yield SensorFailure(sensor, "stuck", Failure.LOST, stuck)
     yield SensorFailure(sensor, "frozen with noise", Failure.STEP, frozen_with_noise(noise))
     for um_per_s in DRIFTS_UM_PER_S:
         for sign in (-1.0, 1.0):
-            name = f"drifts by {sign * um_per_s:+g} um/s"
+            name = f"drifts by {sign * um_per_s:+g} µm/s"
             lie = drift(sign * um_per_s / unit)
             yield SensorFailure(sensor, name, _kind_of_drift(um_per_s), lie, slow=um_per_s <= 0.05)
     for step_um in (-150.0, -30.0, 30.0, 150.0):
-        yield SensorFailure(sensor, f"steps by {step_um:+g} um", Failure.STEP, offset(step_um / unit))
+        yield SensorFailure(sensor, f"steps by {step_um:+g} µm", Failure.STEP, offset(step_um / unit))
     for share in (0.8, 1.25, -1.0):
         yield SensorFailure(sensor, f"scale {share:g}", Failure.STEP, scaled(share))
 
@@ -147,14 +147,14 @@ FIGURE_FAILURES = (
         FilmSensor.OPTICS, "sigma NaN", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=math.nan)
     ),
     SensorFailure(
-        FilmSensor.OPTICS, "sigma 1e3 um", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e3)
+        FilmSensor.OPTICS, "sigma 1e3 µm", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e3)
     ),
     SensorFailure(
-        FilmSensor.OPTICS, "sigma 1e-9 um", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e-9)
+        FilmSensor.OPTICS, "sigma 1e-9 µm", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e-9)
     ),
     SensorFailure(
         FilmSensor.OPTICS,
-        "sigma too small, 2 um of noise",
+        "sigma too small, 2 µm of noise",
         Failure.LOST,
         spoil=lambda f, t, r: replace(f, sag_um=f.sag_um + 2.0 * r.standard_normal(), sag_sigma_um=1e-3),
     ),

@@ -32,7 +32,7 @@ and guards.
 
 *Off* is the largest distance of the true centre from where it was, or on its way, before the pump was taken off for
 good. A setpoint's or an inflation's own way does not count; a pause, manual flow and experiments move the mirror by
-themselves, by up to `states.manual_range_um` (50 um) and some um.
+themselves, by up to `states.manual_range_um` (50 µm) and some µm.
 """
 
 
@@ -63,7 +63,7 @@ def _line(entry: tuple[Cell, Outcome]) -> str:
     cell, outcome = entry
     ended = f"`{outcome.fault}` after {outcome.after_s:.0f} s" if outcome.fault else f"ends in {outcome.state}"
     what = " and ".join(cell.failures)
-    return f"- {cell.process_value}, {cell.undertaking}, {what}: {outcome.off_um:+.0f} um, {ended}"
+    return f"- {cell.process_value}, {cell.undertaking}, {what}: {outcome.off_um:+.0f} µm, {ended}"
 
 
 def _bounds(singles: Results) -> list[str]:
@@ -74,7 +74,7 @@ def _bounds(singles: Results) -> list[str]:
         key = cell.process_value, failure.sensor.value, failure.kind
         if key not in worst or abs(outcome.off_um) > abs(worst[key][1].off_um):
             worst[key] = cell, outcome
-    lines = ["## One sensor fails", "", "| process value | failed | failure | off, um | bound, um | worst case |"]
+    lines = ["## One sensor fails", "", "| process value | failed | failure | off, µm | bound, µm | worst case |"]
     lines += ["|---|---|---|---|---|---|"]
     for (value, sensor, kind), (cell, outcome) in sorted(worst.items(), key=lambda item: str(item[0])):
         case = f"{cell.undertaking}, {BY_WORDS[cell.failures[0]].name}"
@@ -90,7 +90,7 @@ def _activities(singles: Results) -> list[str]:
         if not BY_WORDS[cell.failures[0]].slow:
             key = cell.undertaking, cell.process_value
             worst[key] = max(worst[key], abs(outcome.off_um))
-    lines = ["", "## By what the hold does", "", "Failures that show within minutes; off in um.", ""]
+    lines = ["", "## By what the hold does", "", "Failures that show within minutes; off in µm.", ""]
     lines += ["| | " + " | ".join(value.value for value in ProcessValue) + " |", "|---|" + "---|" * len(ProcessValue)]
     for undertaking in Undertaking:
         cells = " | ".join(f"{worst[undertaking.value, value.value]:.0f}" for value in ProcessValue)
@@ -102,7 +102,7 @@ def _slow_drifts(singles: Results) -> list[str]:
     """Drifts of hours in a hold: what is noticed when, and where it ends."""
     lines = ["", "## Slow drifts in a hold", ""]
     lines += [
-        "| process value | failure | first notice | off then, um | fault | off, um |",
+        "| process value | failure | first notice | off then, µm | fault | off, µm |",
         "|---|---|---|---|---|---|",
     ]
     for cell, outcome in sorted(singles.items(), key=lambda entry: str(entry[0])):
@@ -143,7 +143,7 @@ def _pairs(pairs: Results) -> list[str]:
     ]
     lines += ["Not within that time:", "", *map(_line, late.items()), ""] if late else []
     lines += (
-        [f"{len(far)} pairs lead the mirror further than {NOTABLE_UM:g} um:", "", *map(_line, far.items())]
+        [f"{len(far)} pairs lead the mirror further than {NOTABLE_UM:g} µm:", "", *map(_line, far.items())]
         if far
         else []
     )
@@ -156,8 +156,8 @@ def _weeks(weeks: Mapping[str, Week]) -> list[str]:
         return []
     lines = ["", "## Weeks without a failure", ""]
     lines += [
-        "A room of +-2 K and +-10 % relative humidity a day (+235 um of the centre per 10 % at constant",
-        "pressure), a film that is warmer than its ring (57 um/K), creep and a gauge whose zero drifts by 1 Pa/K.",
+        "A room of +-2 K and +-10 % relative humidity a day (+235 µm of the centre per 10 % at constant",
+        "pressure), a film that is warmer than its ring (57 µm/K), creep and a gauge whose zero drifts by 1 Pa/K.",
         "Each day the hold is paused, driven by hand, tuned, moved to another setpoint, lowered and inflated again",
         "(`tests/campaign/climate_week.py`).",
         "",

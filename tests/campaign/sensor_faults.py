@@ -182,7 +182,7 @@ def blocked(noise: float, seed: int = 1) -> Lie:
 
 
 # Failures that take an hour to show.
-SLOW = ("2 um/min", "-0.05 um/s", "-10 Pa an hour")
+SLOW = ("2 µm/min", "-0.05 µm/s", "-10 Pa an hour")
 UNITS = (10.0, 0.1, 1000.0, 0.001)
 
 
@@ -210,8 +210,8 @@ def _failures(
 FAULTS: tuple[SensorFault, ...] = (
     *_failures(
         "laser",
-        {"+15 um": 15.0, "+40 um": 40.0, "-40 um": -40.0, "-100 um": -100.0},
-        {"2 um/min": 2 / 60, "-2 um/s": -2.0, "-0.2 um/s": -0.2, "-0.05 um/s": -0.05},
+        {"+15 µm": 15.0, "+40 µm": 40.0, "-40 µm": -40.0, "-100 µm": -100.0},
+        {"2 µm/min": 2 / 60, "-2 µm/s": -2.0, "-0.2 µm/s": -0.2, "-0.05 µm/s": -0.05},
         ("gauge", "barometer"),
     ),
     SensorFault("gauge", "shows only noise", blocked(0.5)),
@@ -226,14 +226,14 @@ FAULTS: tuple[SensorFault, ...] = (
     *_failures("gas thermometer", {"+10 K": 10.0}, {"1 K/min": 1 / 60}, units=(10.0,)),
     *_failures("pump read-back", {"+0.04": 0.04, "+0.1": 0.1}, {"0.001/s": 0.001}, ("vent read-back",), (100.0,)),
     *_failures("vent read-back", {"+0.1": 0.1}, {"0.001/s": 0.001}, units=(100.0, 0.01)),
-    *_failures(CAMERA, {"+8 um": 8.0, "+30 um": 30.0}, {"2 um/min": 2 / 60, "0.5 um/s": 0.5}, units=(1000.0, 0.001)),
+    *_failures(CAMERA, {"+8 µm": 8.0, "+30 µm": 30.0}, {"2 µm/min": 2 / 60, "0.5 µm/s": 0.5}, units=(1000.0, 0.001)),
 )
 PAIRS: tuple[tuple[SensorFault, ...], ...] = (
-    (SensorFault("gauge", "stuck", stuck), SensorFault("laser", "drifts by -2 um/s", drift(-2.0))),
-    (SensorFault("gauge", "shows only noise", blocked(0.5)), SensorFault("laser", "drifts by -2 um/s", drift(-2.0))),
+    (SensorFault("gauge", "stuck", stuck), SensorFault("laser", "drifts by -2 µm/s", drift(-2.0))),
+    (SensorFault("gauge", "shows only noise", blocked(0.5)), SensorFault("laser", "drifts by -2 µm/s", drift(-2.0))),
     (
         SensorFault("gauge", "shows only noise", blocked(0.5), lasts_s=3600.0),
-        SensorFault("laser", "drifts by -0.5 um/s", drift(-0.5), lasts_s=3600.0),
+        SensorFault("laser", "drifts by -0.5 µm/s", drift(-0.5), lasts_s=3600.0),
     ),
 )
 

@@ -15,7 +15,7 @@ NOISE_ONLY = SensorFault("gauge", "shows only noise", blocked(0.5))
 
 
 def creep(um_per_s: float) -> SensorFault:
-    return SensorFault("laser", f"drifts by {um_per_s} um/s", drift(um_per_s), lasts_s=400.0)
+    return SensorFault("laser", f"drifts by {um_per_s} µm/s", drift(um_per_s), lasts_s=400.0)
 
 
 @pytest.mark.parametrize(

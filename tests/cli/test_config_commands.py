@@ -156,11 +156,11 @@ def test_explain_prints_the_key(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["config", "explain", "flow_max_um_per_s"]) == 0
     printed = capsys.readouterr().out
     assert "[loop]" in printed
-    assert "flow_max_um_per_s: above 0 .. 100 um/s; default 5.3\n" in printed
+    assert "flow_max_um_per_s: above 0 .. 100 µm/s; default 5.3\n" in printed
     assert "Lower it" in printed
     assert run(["config", "explain", "loop.flow_max_um_per_s", "--json"]) == 0
     ((key,),) = (table["keys"] for table in json.loads(capsys.readouterr().out)["tables"])
-    assert (key["unit"], key["default"]) == ("um/s", "5.3")
+    assert (key["unit"], key["default"]) == ("µm/s", "5.3")
 
 
 def test_the_schema_is_json_and_the_reference_the_page(capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,7 +52,7 @@ HOLDING = replace(
 
 
 def rows(seconds_s: float, start_s: float = 0.0, seed: int = 1) -> list[TelemetryRow]:
-    """A held mirror with 0.3 um of error, correlated over a second."""
+    """A held mirror with 0.3 µm of error, correlated over a second."""
     noise = random.Random(seed)
     error_um, made = 0.0, []
     for k in range(round(seconds_s * RATE_HZ)):

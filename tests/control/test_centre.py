@@ -193,7 +193,7 @@ def test_its_sigma_is_honest_in_a_second_world(laser: bool, gusts: bool) -> None
         ratios.append(np.mean((miss / sigma) ** 2))
         misses.append(miss.std())
     assert 0.5 < math.sqrt(np.mean(ratios)) < 1.3  # the levels are still being learned, from above
-    assert max(misses) < 0.15  # um; the weather there moves the centre by 0.4 within seconds
+    assert max(misses) < 0.15  # µm; the weather there moves the centre by 0.4 within seconds
 
 
 # Bad sensors.

@@ -19,14 +19,14 @@ def answered(loop: LoopConfig, pressure_pa: np.ndarray, air_c: np.ndarray) -> np
 
 
 def test_pressure_step_is_made_good() -> None:
-    """+20 Pa flatten the bowl by 7.16 um; the feed-forward adds as much."""
+    """+20 Pa flatten the bowl by 7.16 µm; the feed-forward adds as much."""
     pressure_pa = np.where(np.arange(1000) < 10, 101_325.0, 101_345.0)
     flow = answered(LoopConfig(), pressure_pa, np.full(1000, 20.0))
     assert flow.sum() * DT_S == pytest.approx(20 * 0.358)
 
 
 def test_temperature_step_is_made_good_as_the_gas_follows() -> None:
-    """+0.1 K swells the gas by 12.3 um, 63 % of it within the gas's lag."""
+    """+0.1 K swells the gas by 12.3 µm, 63 % of it within the gas's lag."""
     air_c = np.where(np.arange(10_000) < 1, 20.0, 20.1)
     given = np.cumsum(answered(LoopConfig(), np.full(10_000, math.nan), air_c)) * DT_S
     assert given[-1] == pytest.approx(-12.3, rel=1e-3)

@@ -13,7 +13,7 @@ from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmMonitor, LeakGrowt
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-# time -> true motion of the film and the laser's error, um; the gauge's error, Pa; the shape loop's trim, um
+# time -> true motion of the film and the laser's error, µm; the gauge's error, Pa; the shape loop's trim, µm
 Story = Callable[[float], tuple[float, float, float, float]]
 Law = Callable[[float], float]
 
@@ -36,7 +36,7 @@ def told(
     rate_hz: float = RATE_HZ,
     seed: int = 1,
 ) -> tuple[str, float]:
-    """The first report, and when; noise 1 um and 0.5 Pa."""
+    """The first report, and when; noise 1 µm and 0.5 Pa."""
     rng = np.random.default_rng(seed)
     monitor = FilmMonitor(LimitsConfig(), mirror or MirrorConfig())
     for tick in range(round(duration_s * rate_hz)):
@@ -60,7 +60,7 @@ def test_a_laser_that_creeps_is_contradicted_by_the_gauge(rate_um_per_s: float) 
     said, at_s = told(story, 300.0)
     assert "laser" in said
     assert "gauge" in said
-    assert (at_s - 100.0) * abs(rate_um_per_s) < 45.0  # um by which the film was led astray
+    assert (at_s - 100.0) * abs(rate_um_per_s) < 45.0  # µm by which the film was led astray
 
 
 def test_what_a_knocked_laser_moves_the_film_by_is_seen_within_half_a_minute() -> None:
@@ -240,9 +240,9 @@ def test_several_times_next_to_nothing_is_still_next_to_nothing() -> None:
 
 
 def test_a_thermometer_that_lies_takes_no_gas_and_a_room_that_cools_takes_what_it_must() -> None:
-    # the feed-forward asks for 2 um/s less, and the integrator gives them back
+    # the feed-forward asks for 2 µm/s less, and the integrator gives them back
     assert math.isnan(grown(lambda t: 3.2 if t > 600 else 1.2, 2.2, 3600, lambda t: 1.2))
-    # the gas shrinks by 2 um/s, and the feed-forward knows it
+    # the gas shrinks by 2 µm/s, and the feed-forward knows it
     assert math.isnan(grown(lambda t: 1.2, 2.2, 3600, lambda t: 3.2 if t > 600 else 1.2))
 
 

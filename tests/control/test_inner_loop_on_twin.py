@@ -47,7 +47,7 @@ def test_doubled_leak_stays_in_the_band() -> None:
 
 @pytest.mark.parametrize("change_pa", [20.0, -20.0])
 def test_door(change_pa: float) -> None:
-    """7 um at once, which nothing can prevent; then back as fast as pump or leak allow, without wind-up."""
+    """7 µm at once, which nothing can prevent; then back as fast as pump or leak allow, without wind-up."""
     figures = answer(ALL, AmbientChange(60.0, change_pa), SEEDS, 2.0)
     assert 6.5 < figures["worst_peak_um"] < 8.0
     assert figures["back_s"] < 8.0

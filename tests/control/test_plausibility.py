@@ -14,7 +14,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's error, camera's error; um
+Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's error, camera's error; µm
 
 
 def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
@@ -25,7 +25,7 @@ def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate
 
 
 def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0) -> list[Liar]:
-    """The verdict on every tick of a story; noise 1 um, 1 um and 0.5 Pa."""
+    """The verdict on every tick of a story; noise 1 µm, 1 µm and 0.5 Pa."""
     rng = np.random.default_rng(seed)
     judge, said = PlausibilityCheck(10.0, 37_100.0), []
     for tick in range(round(duration_s * RATE_HZ)):
@@ -130,7 +130,7 @@ def test_who_is_found_is_believed_again_only_below_half_the_limit() -> None:
     judge, time_s = settled(30.0, 0.0, 0.0)
     for second in range(1, 121):
         said = shown(judge, time_s + second, 7.0, 0.0, 0.0)
-    assert said == Liar.LASER  # 7 um apart: less than the limit, more than half of it
+    assert said == Liar.LASER  # 7 µm apart: less than the limit, more than half of it
     for second in range(121, 241):
         said = shown(judge, time_s + second, 4.0, 0.0, 0.0)
     assert said == Liar.NOBODY

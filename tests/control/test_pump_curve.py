@@ -19,7 +19,7 @@ DT_S = 0.02
 
 
 def delivered(flows_um_per_s: list[float]) -> np.ndarray:
-    """Flow of the twin's pump for the commands, um/s, one value a tick."""
+    """Flow of the twin's pump for the commands, µm/s, one value a tick."""
     curve, pump, out = PumpCurve(PUMP), PumpModel(PUMP, PUMP.flow_full_um_per_s, 0.005), []
     for flow in flows_um_per_s:
         command = curve.command(flow, DT_S)
@@ -41,7 +41,7 @@ def test_pump_gives_what_was_wanted(flow: float) -> None:
 
 
 def test_small_flow_from_rest_starts_the_pump() -> None:
-    """0.35 um/s alone is a command below the start."""
+    """0.35 µm/s alone is a command below the start."""
     added_um = DT_S * np.sum(delivered([0.35] * 200) - 0.35)
     assert abs(added_um) < 0.1
 
@@ -115,7 +115,7 @@ def test_a_curved_pump_gives_what_was_wanted(shape: str) -> None:
 
 @given(st.lists(st.floats(0.2, 6.5), min_size=2, max_size=30))
 def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
-    """Up and down in any order; one branch alone would be wrong by 0.04 of the command, 0.3 um/s."""
+    """Up and down in any order; one branch alone would be wrong by 0.04 of the command, 0.3 µm/s."""
     curve, pump = PumpCurve(measured("hysteretic", play=0.04)), ForeignPump("hysteretic", 7.0, play=0.04, lag_s=1e-3)
     for flow in flows:
         command = curve.command(flow, DT_S)
@@ -127,7 +127,7 @@ def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
 
 @pytest.mark.parametrize("wanted", [0.0, 0.3])
 def test_a_falling_branch_that_ends_in_the_middle_can_be_stopped(wanted: float) -> None:
-    """The pump ran on at its first command, where the branch gives 1.3 um/s: the mirror rose by 62 um."""
+    """The pump ran on at its first command, where the branch gives 1.3 µm/s: the mirror rose by 62 µm."""
     table = {"curve_fraction": (0.086, 0.12, 1.0), "curve_um_per_s": (0.001, 1.8, 6.3)}
     pump = {"start_fraction": 0.0, "stall_fraction": 0.0, "curve_falling_um_per_s": (1.3, 2.0, 6.3)}
     curve = PumpCurve(PumpConfig.model_validate(table | pump))

@@ -14,7 +14,7 @@ from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.pump_drift import PROBE_RAD_PER_S, SEGMENT_S, SIGMA_FIRST, PumpDrift, PumpScale
 
 DT_S = 0.2
-LASER_UM = 0.32  # as 1 um at 50 Hz
+LASER_UM = 0.32  # as 1 µm at 50 Hz
 
 
 @dataclass
@@ -25,9 +25,9 @@ class Bench:
     ends_at: float = 1.0  # scale at the end, in a straight line from `begins_at`
     begins_at: float = 1.0
     probe_um: float = 0.1
-    walk: float = 0.1  # um/sqrt(s), of the centre
-    gusts: float = 0.0  # um/s, one a minute
-    lift: float = 0.0  # um/s, a sine at the probe's own frequency
+    walk: float = 0.1  # µm/sqrt(s), of the centre
+    gusts: float = 0.0  # µm/s, one a minute
+    lift: float = 0.0  # µm/s, a sine at the probe's own frequency
     dead_steps: int = 0
     seed: int = 1
 

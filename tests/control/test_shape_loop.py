@@ -91,7 +91,7 @@ def test_nothing_is_learnt_before_the_loop_is_settled() -> None:
 
 
 def test_trim_goes_to_the_lasers_drift(tracking: Bench) -> None:
-    """The laser reads 3 um too much, the camera sees no change: the setpoint must be 3 um higher."""
+    """The laser reads 3 µm too much, the camera sees no change: the setpoint must be 3 µm higher."""
     tracking.bias_um = 3.0
     out = tracking.run(600.0)
     assert out.trim_um == pytest.approx(3.0, abs=0.01)

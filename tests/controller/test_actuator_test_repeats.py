@@ -44,7 +44,7 @@ def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(rate_hz: floa
 
 
 def noisy_test(rate_hz: float, seed: int, pump_share: float = 1.0, vent_um_per_s: float = 100.0) -> ActuatorTest:
-    """As at a start, of a bench with 1 um of noise: by default a perfect one, with 8 um/s of vent."""
+    """As at a start, of a bench with 1 µm of noise: by default a perfect one, with 8 µm/s of vent."""
     rng = np.random.default_rng(seed)
     pump = PumpConfig()
     test = ActuatorTest(pump, True, rate_hz)

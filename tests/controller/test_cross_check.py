@@ -185,7 +185,7 @@ def test_a_limit_that_its_sensor_cannot_show(changes: dict[str, float], field: s
 
 @pytest.mark.parametrize(("zero", "sound"), [(5.0, True), (9.6, True), (9.4, True), (0.4, False), (1.9, False)])
 def test_the_range_of_a_laser_about_its_zero(zero: float, sound: bool) -> None:
-    """10 mm, the bowl nearer when deeper: with the zero at 0.4 mm a limit of 500 um is in front of the range."""
+    """10 mm, the bowl nearer when deeper: with the zero at 0.4 mm a limit of 500 µm is in front of the range."""
     laser = {"driver": "optoncdt1420", "port": "/dev/x", "range_mm": 10.0, "zero_mm": zero}
     shallow = {"limits.displacement_min_um": -300.0, "shape.trim_max_um": 100.0}
     config = config_of(shallow, {**ROLES, "displacement": laser})

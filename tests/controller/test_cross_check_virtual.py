@@ -133,9 +133,9 @@ def failures(config: Config, event: str) -> Iterator[str]:
         yield f"never held: {story.faults_before}"
         return
     if story.furthest_um > 3.0 * config.limits.band_um + 3.0:
-        yield f"wandered {story.furthest_um:.1f} um while it said hold"
+        yield f"wandered {story.furthest_um:.1f} µm while it said hold"
     if story.highest_um > HIGHEST_UM:
-        yield f"{story.highest_um:.0f} um above its setpoint after {event}"
+        yield f"{story.highest_um:.0f} µm above its setpoint after {event}"
     if story.pumping_at_the_end:
         yield f"still pumping {AFTER_S:g} s after {event}"
 

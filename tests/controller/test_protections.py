@@ -295,7 +295,7 @@ def test_gas_that_the_film_takes_is_judged_while_only_the_optics_show_it_standin
 
     def fail(wrong: Wrong, since_s: float) -> None:
         wrong.no_light = True
-        wrong.vent_stuck_fraction = 0.02  # the film takes 2 um/s more
+        wrong.vent_stuck_fraction = 0.02  # the film takes 2 µm/s more
 
     held = settled(config_of("estimate", limits=limits), settle_s=130.0).fail(150.0, fail)
     assert held.faults == ["gas_excess"]

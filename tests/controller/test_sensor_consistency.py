@@ -68,7 +68,7 @@ def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(90, leak_um_per_s=3.0)
-    assert "3.0 um/s of gas; it used to take 1.2 um/s" in mirror.consistency.gas_excess
+    assert "3.0 µm/s of gas; it used to take 1.2 µm/s" in mirror.consistency.gas_excess
     mirror.pass_by(1, leak_um_per_s=3.0, state=State.FAULT)
     assert mirror.consistency.gas_excess == ""
     mirror.pass_by(600, leak_um_per_s=3.0)
@@ -136,7 +136,7 @@ def test_a_camera_that_repeats_one_shape_is_believed_neither_in_the_shape_nor_in
 def test_a_gauge_that_drifts_for_hours_against_the_laser_raises_one_notice_and_its_end() -> None:
     mirror = Seconds()
     mirror.pass_by(100)
-    for tenth in range(130):  # 0.1 Pa, 2 um, in 100 s: by 260 um
+    for tenth in range(130):  # 0.1 Pa, 2 µm, in 100 s: by 260 µm
         mirror.pass_by(100, gauge_pa=600.0 + 0.1 * tenth)
     notices = [event for event in mirror.events if getattr(event, "name", "") == "slow_drift"]
     assert [event.kind for event in notices] == ["maintenance"]

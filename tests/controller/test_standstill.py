@@ -99,9 +99,9 @@ def test_the_last_of_two_commands_must_be_off_as_well() -> None:
 def test_a_mirror_that_rises_shows_a_pump_whose_read_back_lies() -> None:
     watched = Watched()
     seen = watched.rises(2.0, 0.13)
-    assert seen.startswith("+40 um")
+    assert seen.startswith("+40 µm")
     assert watched.now_s < 22.0
-    assert not Watched().rises(1.4, 0.09)  # below the limit: 28 um in 20 s
+    assert not Watched().rises(1.4, 0.09)  # below the limit: 28 µm in 20 s
 
 
 def test_laser_and_gauge_must_both_see_it_and_each_decides_without_the_other() -> None:
@@ -113,7 +113,7 @@ def test_laser_and_gauge_must_both_see_it_and_each_decides_without_the_other() -
 
 
 def test_warm_air_and_a_falling_barometer_are_allowed_for() -> None:
-    """1 K of warmer air lifts the mirror by 123 um, 100 Pa less of ambient pressure by 36 um."""
+    """1 K of warmer air lifts the mirror by 123 µm, 100 Pa less of ambient pressure by 36 µm."""
     for change in ({"air_temperature_c": 24.0}, {"ambient_pressure_pa": 101225.0}):
         watched = Watched()
         for _ in range(10):

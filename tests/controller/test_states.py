@@ -22,7 +22,7 @@ def played(*at: dict[str, Any], duration_s: float = 60.0, **config: Any) -> Outc
     )
 
 
-# 150 um to inflate, and a ramp that waits
+# 150 µm to inflate, and a ramp that waits
 _FAR_BELOW: dict[str, Any] = {
     "duration_s": 200.0,
     "twin": {"start_error_um": -150.0, "scenario": "calm"},
@@ -155,7 +155,7 @@ def test_manual_ends_where_the_mirror_strays_too_far(flow: float) -> None:
     outcome = played({"time_s": 20.0, "command": "manual", "value": flow}, duration_s=200.0)
     (manual_s,) = changes(outcome, "manual")
     back = next(e for e in outcome.of("state") if e["from"] == "manual")
-    assert back["why"].startswith("manual is over: more than 50 um")
+    assert back["why"].startswith("manual is over: more than 50 µm")
     away_um = [abs(tick.row.truth_displacement_um) for tick in outcome.ticks if tick.row.mono_s > manual_s]
     assert 45.0 < max(away_um) < 60.0
     assert State(outcome.ticks[-200].row.state) == State.HOLD
@@ -184,7 +184,7 @@ def test_nobody_takes_the_pump_while_the_mean_flow_is_held() -> None:
 
 
 def test_a_pause_ends_where_the_mirror_strays_too_far() -> None:
-    """A leak of twice the size: on the old mean flow the mirror sinks by 1 um/s."""
+    """A leak of twice the size: on the old mean flow the mirror sinks by 1 µm/s."""
     outcome = played(
         {"time_s": 20.0, "command": "pause"},
         {"time_s": 21.0, "event": "leak", "value": 3.0},

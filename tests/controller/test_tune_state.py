@@ -100,7 +100,7 @@ STEPS = [
 
 
 def test_a_pump_map_gives_its_commands_until_the_heights() -> None:
-    """Down 3 um at 1.24 um/s, up 5 um at 1.7 um/s, then a second at the holding command."""
+    """Down 3 µm at 1.24 µm/s, up 5 µm at 1.7 µm/s, then a second at the holding command."""
     held = Held()
     held.go(0.1, tune(kind="pump_map", duration_s=60.0, steps=STEPS))
     held.until_hold(60.0)
@@ -273,7 +273,7 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
 
 
 class Stepped:
-    """A controller with its shape loop on and the setpoint at 2 um, told of trials that step the setpoint."""
+    """A controller with its shape loop on and the setpoint at 2 µm, told of trials that step the setpoint."""
 
     def __init__(self) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
@@ -377,14 +377,14 @@ def test_the_flow_of_the_curve_in_force_bounds_what_a_person_may_ask_for() -> No
     held = Held()
     asked = Command("manual", "tester", value=8.0)
     held.go(0.1, asked)
-    assert held.of("command")[-1]["refused"] == "flow 8 um/s is outside 0 .. 5.3 um/s"
+    assert held.of("command")[-1]["refused"] == "flow 8 µm/s is outside 0 .. 5.3 µm/s"
     held.go(0.1, on_curve(TWICE, 10.0))
     held.go(0.1, asked)
     assert "refused" not in held.of("command")[-1]
     held.go(0.1, Command("hold", "tester"))
     held.go(10.0)
     held.go(0.1, asked)
-    assert held.of("command")[-1]["refused"] == "flow 8 um/s is outside 0 .. 5.3 um/s"
+    assert held.of("command")[-1]["refused"] == "flow 8 µm/s is outside 0 .. 5.3 µm/s"
 
 
 def test_the_reserve_is_judged_by_the_curve_in_force() -> None:

@@ -331,7 +331,7 @@ def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
 
 @pytest.mark.parametrize("shape_off", [False, pytest.param(True, marks=pytest.mark.campaign)])
 def test_a_laser_whose_mount_drifts_takes_over_where_the_mirror_is(shape_off: bool) -> None:
-    """The camera goes after four minutes of drift by 2 um/min: half a minute later the mirror is 1 um off, not 7."""
+    """The camera goes after four minutes of drift by 2 µm/min: half a minute later the mirror is 1 µm off, not 7."""
 
     def lose(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = 300.0 < now_s < 330.0 and not shape_off
@@ -460,7 +460,7 @@ def test_knock_and_jump_at_once_are_told_apart() -> None:
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER, BY_OPTICS], ids=["all", "laser", "optics"])
 @pytest.mark.parametrize("seed", range(15))
 def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) -> None:
-    """Below 10 um the optics prevail in the trim; 20 um and a third are what optics alone and gauge may be apart."""
+    """Below 10 µm the optics prevail in the trim; 20 µm and a third are what optics alone and gauge may be apart."""
     rng = np.random.default_rng(seed)
     least_um = 32.0 if config is BY_OPTICS else 22.0
     um = float(np.exp(rng.uniform(math.log(least_um), math.log(60.0))) * rng.choice([-1.0, 1.0]))
@@ -523,7 +523,7 @@ def _warmed(um_per_k: float, told_um_per_k: float, hours: float) -> tuple[list[V
 @pytest.mark.campaign
 @pytest.mark.parametrize(("told_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"])
 def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(told_um_per_k: float, most_um: float) -> None:
-    """It truly grows by 0.44 um/K: what is known of it is 30 % wrong."""
+    """It truly grows by 0.44 µm/K: what is known of it is 30 % wrong."""
     ticks, growing = _warmed(0.44, told_um_per_k, 2.5)
     assert not told(ticks, Fault)
     moved_um = true_um(ticks, ticks[-1].row.mono_s - 60.0).mean() - true_um(ticks, 30.0, 60.0).mean()
@@ -532,13 +532,13 @@ def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(told_um_per_
     (notice,) = told(ticks, Maintenance)
     assert notice.name == "stand_growth"
     assert notice.message.startswith(
-        "the optics' stand is +1.3 K from the reference: the figure may be off by 0.5 um;"
+        "the optics' stand is +1.3 K from the reference: the figure may be off by 0.5 µm;"
     )
     assert growing.um > 0.7
 
 
 def test_what_a_stand_is_known_to_grow_does_not_move_the_mirror() -> None:
-    """A stand of straw: 20 um/K, and follows within seconds; a new lock ends the notice."""
+    """A stand of straw: 20 µm/K, and follows within seconds; a new lock ends the notice."""
     growing = Growing(20.0, 4.0, lambda now_s: 0.1 if now_s > 18.0 else 0.0)
     estimator = EstimatorConfig(
         process_value="estimate", stand_um_per_k=20.0, stand_sigma_um_per_k=10.0, stand_follows_air_s=4.0

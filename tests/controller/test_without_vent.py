@@ -84,7 +84,7 @@ def test_check_warns_of_it_with_the_time_and_its_basis() -> None:
     assert finding.severity == "warning"
     assert "no vent is fitted" in finding.why
     assert "from 600 to 100 Pa in about 9.6 h" in finding.why
-    assert "twin.leak_time_constant_s = 10000 s, which is a leak of 1.2 um/s" in finding.why
+    assert "twin.leak_time_constant_s = 10000 s, which is a leak of 1.2 µm/s" in finding.why
 
 
 def test_a_slack_film_needs_no_estimate() -> None:

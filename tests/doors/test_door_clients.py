@@ -338,7 +338,7 @@ async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
             **{f"setpoint.{each}": "ECA_NOWTACCESS" for each in fields},
             "stop.ASG DEF": "ECA_NOWTACCESS", "stop.DISP [1]": "ECA_NOWTACCESS",
             "setpoint nan": finite,
-            "setpoint 100": "setpoint refused: setpoint 1e+09 um is outside the limits (-2000 .. 500 um)",
+            "setpoint 100": "setpoint refused: setpoint 1e+09 µm is outside the limits (-2000 .. 500 µm)",
             "mark xxx": "mark refused: longer than 500 bytes",
             "mark b'\\": "mark refused: text: only printable characters, in one line",
         }  # fmt: skip

@@ -72,7 +72,7 @@ def test_identity_and_reading() -> None:
         assert (first.displacement_um, first.quality, first.sample_counter) == (-123.0, 0, 1)
         bench.displacement_um = -121.4
         second = await bench.driver.displacement()
-        assert second.displacement_um == -121.0  # steps of 1 um
+        assert second.displacement_um == -121.0  # steps of 1 µm
         assert second.sample_counter == 2
         assert second.device_time_s > first.device_time_s
         assert "9600 8N1" in bench.driver.describe()["port"]
@@ -113,7 +113,7 @@ def test_what_is_no_value(displacement_um: float, quality: int) -> None:
 def test_a_jump_is_believed_when_repeated() -> None:
     async def test(bench: Bench) -> None:
         bench.displacement_um = -100.0
-        with pytest.raises(LinkError, match="jump to -100 um"):
+        with pytest.raises(LinkError, match="jump to -100 µm"):
             await bench.driver.displacement()
         assert (await bench.driver.displacement()).displacement_um == -100.0
 
@@ -148,7 +148,7 @@ def test_each_fault_is_an_error_and_passes(faults: SerialFaults) -> None:
     ("settings", "error_state", "message"),
     [
         ({"amplifier": 2}, 0, "there are only 1"),
-        ({"step_max_um": 0.5}, 0, "steps of 1 um"),
+        ({"step_max_um": 0.5}, 0, "steps of 1 µm"),
         ({}, 5, "0000000000000101"),
     ],
 )

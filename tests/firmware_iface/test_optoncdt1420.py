@@ -203,7 +203,7 @@ def test_a_jump_is_believed_when_repeated() -> None:
         await bench.tick()
         bench.displacement_um = 500.0
         await asyncio.sleep(0.02)
-        with pytest.raises(LinkError, match=r"jump to 499\.7 um"):
+        with pytest.raises(LinkError, match=r"jump to 499\.7 µm"):
             await bench.tick()
         assert await bench.tick() == pytest.approx(500.0, abs=STEP_UM)
 

@@ -49,14 +49,14 @@ def test_only_a_recording_that_is_there_is_offered(
     assert "open it:    membrane-ctrl review last\n" in words(run_dir, capsys)
 
 
-FAULT = Fault(14, "laser_implausible", "the laser is wrong", "laser +9 um", "limits.x", "hold_flow", False, "look")
+FAULT = Fault(14, "laser_implausible", "the laser is wrong", "laser +9 µm", "limits.x", "hold_flow", False, "look")
 
 
 @pytest.mark.parametrize(
     ("exit_", "fault", "says"),
     [
-        (Exit.SAFETY_TRIP, FAULT, ["FAULT 14 laser_implausible: the laser is wrong", "laser +9 um", "look"]),
-        (Exit.DEVICE_FAILED, FAULT, ["FAULT 14 laser_implausible", "laser +9 um", "look"]),
+        (Exit.SAFETY_TRIP, FAULT, ["FAULT 14 laser_implausible: the laser is wrong", "laser +9 µm", "look"]),
+        (Exit.DEVICE_FAILED, FAULT, ["FAULT 14 laser_implausible", "laser +9 µm", "look"]),
         (Exit.DEVICE_FAILED, None, ["DEVICE FAILED", "to do: ", "supply"]),
         (Exit.SAFETY_TRIP, None, ["SAFETY TRIP", "to do: "]),
         (Exit.DONE, None, []),

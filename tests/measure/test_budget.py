@@ -39,7 +39,7 @@ INSIDE = np.hypot(X, Y) <= 475
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors in um beside what was stated of them."""
+    """Errors in µm beside what was stated of them."""
 
     height_um: float
     sag_um: float
@@ -131,7 +131,7 @@ def test_optics_that_are_off(off: dict[str, float], doubt: str) -> None:
 def test_a_film_that_is_not_henckys(prestrain: float, poisson: float) -> None:
     """Its row is the error of the sag, since nothing else is wrong here; of Hencky's film it is noise.
 
-    A stretched film's slopes are finite and bend its profile beyond the shapes that the row knows: 0.28 um for 0.19.
+    A stretched film's slopes are finite and bend its profile beyond the shapes that the row knows: 0.28 µm for 0.19.
     """
     found = measured(STATED, film=typical_film(37.1, 500.0, 3, prestrain, poisson))
     row, none = (

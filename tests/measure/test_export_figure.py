@@ -107,7 +107,7 @@ def test_fringe_terms_are_fitted_to_the_map(result: Path) -> None:
     rho, theta = np.hypot(GX, GY) / table["radius_mm"], np.arctan2(GY, GX)
     terms = [zernike_nm(*order, rho, theta, norm=False) for order in table["n_m"]]
     off_um = (1e3 * HEIGHT - np.tensordot(table["coeffs_um"], terms, axes=1))[np.isfinite(HEIGHT)]
-    assert np.sqrt(np.mean(off_um**2)) < 0.6  # what 37 terms leave of a narrow dent of 3 um
+    assert np.sqrt(np.mean(off_um**2)) < 0.6  # what 37 terms leave of a narrow dent of 3 µm
     exported(result, "zygo-xyz", "--zernike", "noll")
     table = json.loads((result / "figure.xyz.zernike.json").read_text())
     assert (table["coeffs_um"], table["radius_mm"]) == (COEFFS, 500.0)

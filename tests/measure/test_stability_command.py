@@ -24,7 +24,7 @@ SETS, INTERVAL_S, DRIFT_UM_PER_S = 13, 60.0, 0.02
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run over twelve minutes in which the film sinks by 1.2 um a minute."""
+    """A run over twelve minutes in which the film sinks by 1.2 µm a minute."""
     folder = tmp_path_factory.mktemp("sets") / "run"
     motion = ["--sets", str(SETS), "--interval-s", str(INTERVAL_S), "--drift-um-per-s", str(DRIFT_UM_PER_S)]
     assert run(["simulate", str(folder), "--shrink", "12", *motion]) == 0
@@ -93,7 +93,7 @@ def test_pairs_of_every_set(result: Path) -> None:
     assert (minute["lag_s"], minute["count"]) == (60.0, SETS - 1)
     assert (ten["lag_s"], ten["count"]) == (600.0, SETS - 10)
     assert ten["change_rms_um"]["mean"] == pytest.approx(10 * minute["change_rms_um"]["mean"], rel=0.05)
-    # noise of 1/144 of the real sensor's pixels; the geometry's 12 um cancel
+    # noise of 1/144 of the real sensor's pixels; the geometry's 12 µm cancel
     assert 0.02 < minute["rmse_um"]["mean"] < 0.08
     assert table["rmse_um"]["mean"] > 100 * ten["rmse_um"]["mean"]
     listed = rows(result / "pairs.csv")

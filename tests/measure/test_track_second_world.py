@@ -71,7 +71,7 @@ def test_errors_are_as_large_as_their_bars(tmp_path: Path, effect: str) -> None:
 def test_bands_as_wide_as_the_fringes_bend_no_figure(
     tmp_path: Path, pulses_hz: float, rolling_s: float, frames: int
 ) -> None:
-    """Without them in the fit, the sag was off by 0.27 um, and terms by five sigma, in figures called ok.
+    """Without them in the fit, the sag was off by 0.27 µm, and terms by five sigma, in figures called ok.
 
     The slow pulses make bands of 16 %, which a fit without them throws out.
     """
@@ -93,7 +93,7 @@ def test_noise_is_no_motion_of_the_reference(tmp_path: Path) -> None:
 
 
 def test_harmonics_of_the_panel_are_no_motion_of_the_reference(tmp_path: Path) -> None:
-    """The fourth scattered the places by 0.37 um; noise of the laser then counted as motion: 0.12 um of figure."""
+    """The fourth scattered the places by 0.37 µm; noise of the laser then counted as motion: 0.12 µm of figure."""
     disturbed = {"bend": 0.08, "noise_adu": 0.05, "bits": 16, "laser_um": 1.0}
     CrossedWorld(seed=1, **CLEAN | FEW_FRINGES | disturbed).write_reference(tmp_path / "full")  # type: ignore[arg-type]
     checked = Figures().of(tmp_path / "full").checked
@@ -112,7 +112,7 @@ def test_weak_bands_are_known_before_light_is_taken_from_the_first_frames(tmp_pa
 
 
 def test_bands_that_the_fit_takes_are_seen_in_what_little_it_leaves(tmp_path: Path) -> None:
-    """In noise, without first steps, the first frames were 13 sigma off: 0.8 um of a term of order 29."""
+    """In noise, without first steps, the first frames were 13 sigma off: 0.8 µm of a term of order 29."""
     bench = {
         "width": 245, "height": 205, "pixel_um": 75.77, "focal_mm": 45.54, "a_mm": 3102.7, "b_mm": 4169.6,
         "alpha_deg": 74.895, "sag_mm": 25.817, "astigmatism_mm": (-0.347, 0.277), "coma_mm": -0.0941,
@@ -332,7 +332,7 @@ def light_of(world: CrossedWorld) -> Array:
 
 
 def cramer_rao_um(noise_adu: float) -> Array:
-    """Least 1 sigma (terms - 1,) in um of all terms but piston; maps of level and both contrasts are unknown, too."""
+    """Least 1 sigma (terms - 1,) in µm of all terms but piston; maps of level and both contrasts are unknown, too."""
     setup = CLEAN | SIZE
     seen = light_of(BentWorld(**setup))  # type: ignore[arg-type]
     columns = []
@@ -391,7 +391,7 @@ def test_jumps_lose_no_order_silently(
         off_um = np.array([found.sag_um - first.sag_um - deeper_um, *(found.coeffs_um - first.coeffs_um)[1:3]])
         off_um[1:] -= tilt[2], tilt[3]
         if found.verdict != "rejected" and not np.abs(off_um).max() < 0.5:
-            wrong.append(f"{deeper_um:.0f} um, {tilt_mrad:.2f} mrad: {found.verdict}, {off_um} um off")
+            wrong.append(f"{deeper_um:.0f} µm, {tilt_mrad:.2f} mrad: {found.verdict}, {off_um} µm off")
     with capsys.disabled():
-        print(f"\nup to {most_um:g} um, {most_mrad:g} mrad: {dict(seen)}")
+        print(f"\nup to {most_um:g} µm, {most_mrad:g} mrad: {dict(seen)}")
     assert wrong == []

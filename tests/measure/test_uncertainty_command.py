@@ -36,7 +36,7 @@ EXACT = "[geometry.sigmas]\n" + "".join(f"{name} = 0.0\n" for name in SigmasConf
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One full set and a fringes set a minute and 6 um later."""
+    """One full set and a fringes set a minute and 6 µm later."""
     folder = tmp_path_factory.mktemp("sets") / "run"
     motion = ["--sets", "2", "--interval-s", "60", "--drift-um-per-s", "0.1"]
     assert run(["simulate", str(folder), "--shrink", "12", *motion]) == 0

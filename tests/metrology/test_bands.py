@@ -214,7 +214,7 @@ def measured(world: CrossedWorld, folder: Path) -> tuple[Array, str]:
 def test_bands_bend_no_figure_of_a_full_set(
     tmp_path: Path, pulses_hz: float, rolling_s: float, most_um: float, said: str
 ) -> None:
-    """Those of 1 % moved it by 0.1 um, those of 16 % by micrometres or to a refusal."""
+    """Those of 1 % moved it by 0.1 µm, those of 16 % by micrometres or to a refusal."""
     steady = CrossedWorld(seed=1, **SIZE | CLEAN)  # type: ignore[arg-type]
     pulsed = CrossedWorld(seed=1, backlight_hz=pulses_hz, rolling_s=rolling_s, **SIZE | CLEAN)  # type: ignore[arg-type]
     (before_um, before), (after_um, after) = measured(steady, tmp_path / "a"), measured(pulsed, tmp_path / "b")

@@ -101,7 +101,7 @@ def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
 
 @pytest.mark.parametrize("name", ["focal_relative", "pitch_relative"])
 def test_a_lens_or_a_screen_off_by_a_thousandth_is_within_the_claim(name: str) -> None:
-    """Held as exact they put the sag 31 to 36 um off, ten times the claim of then."""
+    """Held as exact they put the sag 31 to 36 µm off, ten times the claim of then."""
     values = np.where(np.array(NAMES) == name, 1e-3, 0.0)
     truth = make(values, seed=3, points=600)
     pitch = 1 + values[NAMES.index("pitch_relative")]  # which the trace does not have

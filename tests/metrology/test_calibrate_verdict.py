@@ -70,7 +70,7 @@ def test_good_sets_have_nothing_against_them() -> None:
         (
             reading(lambda d: 7.0),
             ALL_SETS,
-            "the laser's unit or scale is wrong, or it is stuck: its readings are 0 um",
+            "the laser's unit or scale is wrong, or it is stuck: its readings are 0 µm",
         ),
         (reading(lambda d: d + 50), (1,), "set1 disagrees with all the others: its laser reads +"),
     ],
@@ -84,7 +84,7 @@ def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -
 @pytest.mark.parametrize(
     ("edit", "which", "says"),
     [
-        (reading(lambda d: d + 50), (1,), "the film moved by 9 um RMS while set1 was taken: hold it still"),
+        (reading(lambda d: d + 50), (1,), "the film moved by 9 µm RMS while set1 was taken: hold it still"),
         (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
     ],
 )
@@ -102,7 +102,7 @@ def test_a_film_that_moved_is_named_alone_unless_the_still_sets_have_a_cause(
 def test_sets_that_are_too_close_are_refused() -> None:
     (finding,) = judged(make(VALUES, 3, points=800, sags_mm=(36.8, 37.0, 37.2)))
     assert finding.fatal
-    assert finding.says.startswith("the sets are only 400 um apart")
+    assert finding.says.startswith("the sets are only 400 µm apart")
     assert "at least 1 mm" in finding.says
 
 
@@ -202,7 +202,7 @@ def test_the_monitor_waits_for_many_cycles_and_forgives_one() -> None:
     assert monitor.says == ""
     for _ in range(CYCLES):
         monitor.add(1.4, 0.6)
-    assert monitor.says.startswith("calibrate again: the fit leaves 1.40 urad")
+    assert monitor.says.startswith("calibrate again: the fit leaves 1.40 µrad")
     assert monitor.says.endswith("predicts 1.00")
 
 

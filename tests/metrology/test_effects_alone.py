@@ -30,7 +30,7 @@ def assert_held(effect: Effect, doubt: str) -> None:
 @pytest.mark.parametrize("moved_um", [100, 500])
 def test_a_film_that_moved_without_a_laser_is_in_the_bar_of_its_sag(moved_um: int) -> None:
     """The mean of the frames is half the motion away from the first: the sag was 6 sigma off."""
-    assert_held(BY_NAME[f"film {moved_um} um deeper in y, no laser"], "from the x to the y frames")
+    assert_held(BY_NAME[f"film {moved_um} µm deeper in y, no laser"], "from the x to the y frames")
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_what_a_set_says_of_itself_is_in_its_verdict(name: str, doubt: str) -> N
 
 
 def test_a_resting_film_with_a_figure_of_its_own_has_not_moved(tmp_path: Path) -> None:
-    """Its ripple is no term of the fit, and no motion: it counted as 26 +- 6 um of it."""
+    """Its ripple is no term of the fit, and no motion: it counted as 26 +- 6 µm of it."""
     world = CrossedWorld(seed=1, **(SIZE | CLEAN), bits=16, noise_adu=0.05)  # type: ignore[arg-type]
     world.write_reference(tmp_path / "full")
     assert run(["measure", str(tmp_path / "full"), "--no-pictures"]) == Exit.DONE

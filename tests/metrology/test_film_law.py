@@ -10,7 +10,7 @@ from metrology_truth import film_solution, hencky_depth
 from membrane_ctrl.metrology.optics.film_law import FilmLaw, HarmonicCause
 
 RHO = np.linspace(0, 1, 41)
-STIFFNESS = 2.05e5  # 50 um of 4.1 GPa
+STIFFNESS = 2.05e5  # 50 µm of 4.1 GPa
 RADIUS_MM = 500.0
 
 

@@ -31,7 +31,7 @@ def error_um(surface: Surface, film: FilmShape = FILM, displacement_um: float = 
 
 
 def named(kind: str, frame: str, steps: int = 4, gamma: float = 1.0) -> tuple[set[str], list[str], float | None]:
-    """Frames flagged, reasons, and the figure's error in um (None if rejected)."""
+    """Frames flagged, reasons, and the figure's error in µm (None if rejected)."""
     stack = faulty_set(kind, frame, steps, gamma)
     try:
         checked = check(stack, bench(steps))
@@ -57,7 +57,7 @@ def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
     stack = good_set(bench())
     place = NAMES.index(frame)
     before, own = stack.frames[place - 1 : place + 1].astype(float)
-    stack.frames[place] = np.rint(0.95 * own + 0.05 * before)  # 4 um of figure if nobody notices
+    stack.frames[place] = np.rint(0.95 * own + 0.05 * before)  # 4 µm of figure if nobody notices
     checked = check(stack, bench())
     assert [NAMES[flag.frame] for flag in checked.flags] == [frame]
     assert error_um(checked.state.surface) < 0.05

@@ -130,7 +130,7 @@ def test_motion_is_taken_out_of_the_phase() -> None:
 def test_noisy_pictures_move_no_film_and_hide_no_motion(
     motion_um: Callable[[float], float], most_um: float, most_left_um: float
 ) -> None:
-    """The laser tells a motion from x to y with a noise of 0.7 um, most of which was taken out of a film at rest."""
+    """The laser tells a motion from x to y with a noise of 0.7 µm, most of which was taken out of a film at rest."""
     optics, rng, off_um, sigma_um, left_um, film_um = bench(noise_adu=3.0), np.random.default_rng(6), [], [], [], []
     for seed in (1, 2, 3):
         stack = good_set(optics, motion_um=motion_um, seed=seed)
@@ -169,7 +169,7 @@ def test_the_frames_say_what_light_they_had_and_where_the_film_was(flicker: floa
 
 @pytest.mark.parametrize(("flicker", "drift"), [(0.02, 0.0), (0.0, 0.05)], ids=["lamp", "ambient"])
 def test_light_that_differs_between_the_frames_is_taken_out(flicker: float, drift: float) -> None:
-    """Two hundredths of flicker bend the figure by 0.3 um, an ambient light that grows by a twentieth by 0.14."""
+    """Two hundredths of flicker bend the figure by 0.3 µm, an ambient light that grows by a twentieth by 0.14."""
     optics, rng = bench(), np.random.default_rng(8)
     stack = good_set(optics)
     quiet = measured(stack, optics).surface.height(X, Y)

@@ -93,7 +93,7 @@ def test_fringes_follow_the_film(displacement_um: float) -> None:
 
 
 def test_fringe_orders_are_carried_on_from_cycle_to_cycle() -> None:
-    """1.2 mm in steps of 300 um: more than a fringe in all, less than half a fringe per step."""
+    """1.2 mm in steps of 300 µm: more than a fringe in all, less than half a fringe per step."""
     live = _live()
     for displacement_um in (300.0, 600.0, 900.0, 1200.0):
         estimate = live.fringes(*_render("fringes", displacement_um))
@@ -211,7 +211,7 @@ def _moving(amplitude_um: float) -> np.ndarray:
 
 
 def test_motion_during_the_frames_is_taken_out() -> None:
-    """The film swings by 5 um at 0.3 Hz; the figure is that of the mean position."""
+    """The film swings by 5 µm at 0.3 Hz; the figure is that of the mean position."""
     live = _live()
     where = _moving(5.0)
     frames, times, _ = _render("fringes", where)
@@ -368,7 +368,7 @@ def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
     still = live.fringes(*_render("fringes"))
     found = [live.fringes(_flickering("fringes", seed, 0.02), np.zeros(8), np.zeros(8)) for seed in range(12)]
     apart_um = np.array([e.coeffs_um - still.coeffs_um for e in found])[:, 3:]
-    assert np.abs(apart_um).max() < 0.1  # 0.4 um and more where the light is taken for even
+    assert np.abs(apart_um).max() < 0.1  # 0.4 µm and more where the light is taken for even
     bar_um = np.array([np.sqrt(np.diag(e.covariance_um2))[3:] for e in found])
     share = np.mean(np.abs(apart_um) < 1.96 * np.hypot(bar_um, np.sqrt(np.diag(still.covariance_um2))[3:]))
     assert share >= 0.9
@@ -377,7 +377,7 @@ def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
 
 @pytest.mark.parametrize(("share", "most_um"), [(0.02, 0.05), (0.12, 0.3)])
 def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(share: float, most_um: float) -> None:
-    """They moved the figure by 0.3 and 1.6 um in cycles called ok; large ones are told."""
+    """They moved the figure by 0.3 and 1.6 µm in cycles called ok; large ones are told."""
     row, random = (
         np.arange(float(OPTICS.camera.height_px))[:, None] / OPTICS.camera.height_px,
         np.random.default_rng(3),
@@ -409,7 +409,7 @@ def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.Mo
 
 
 def test_a_noisy_laser_is_in_the_bar() -> None:
-    """Readings with 1 um of noise turn x against y: astigmatism of 0.1 um, fifty times the noise of the pixels."""
+    """Readings with 1 µm of noise turn x against y: astigmatism of 0.1 µm, fifty times the noise of the pixels."""
     live = LiveReconstructor(OPTICS, 2, laser_noise_um=1.0)
     live.full(*_render("full"))
     where, rng = _moving(5.0), np.random.default_rng(4)
@@ -423,7 +423,7 @@ def test_a_noisy_laser_is_in_the_bar() -> None:
 
 
 def test_the_harmonics_of_the_display_move_with_the_film() -> None:
-    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 um of sag, five times the noise."""
+    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 µm of sag, five times the noise."""
     light = Light(gamma=2.0)
     live, where = _live(light=light, bin_px=2), _moving(25.0)
     still = live.fringes(*_render("fringes", float(where.mean()), light=light))

@@ -70,7 +70,7 @@ def test_figure_of_the_bins_is_the_film() -> None:
 
 
 def test_figure_of_a_moving_film() -> None:
-    """5 um at 0.3 Hz over the 8 frames, with the laser's readings."""
+    """5 µm at 0.3 Hz over the 8 frames, with the laser's readings."""
     shown = [p for p in patterns(OPTICS) if p.role == "sin"]
     where_um = 5 * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(8))
     frames = np.stack([_renderer().render(p, float(d)) for p, d in zip(shown, where_um, strict=True)])
@@ -144,7 +144,7 @@ def test_linear_covariance_is_that_of_the_monte_carlo(count: int, within: float)
 
 @pytest.mark.campaign
 def test_the_papers_figures() -> None:
-    """Absolute: the largest is the paper's 50 um, the mean half of its 24.8. Pairs: geometry cancels (docs)."""
+    """Absolute: the largest is the paper's 50 µm, the mean half of its 24.8. Pairs: geometry cancels (docs)."""
     sets = [_bench(), _bench(20.0)]
     trials = run_trials(sets, PAPER_SPREAD, 1, range(1000))
     absolute_um = 1e3 * MAP.sigma(trial_covariance(trials[:, 0]))
@@ -157,7 +157,7 @@ def test_the_papers_figures() -> None:
 
 
 def test_what_a_wrong_geometry_does_to_a_change_is_in_proportion_to_it() -> None:
-    """300 um deeper: without noise the geometry alone is some 1e-3 of the change."""
+    """300 µm deeper: without noise the geometry alone is some 1e-3 of the change."""
     sets = [_bench(), _bench(300.0)]
     jacobian = geometry_jacobian(sets[1], PAPER_SPREAD) - geometry_jacobian(sets[0], PAPER_SPREAD)
     pair_um = 1e3 * MAP.sigma(geometry_covariance(jacobian, PAPER_SPREAD))

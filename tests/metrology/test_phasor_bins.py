@@ -103,7 +103,7 @@ def test_phase_is_followed_across_its_jumps(steps: int) -> None:
 
 
 def test_known_motion_is_taken_out_of_the_steps() -> None:
-    """20 um, 3 mrad of phase a micrometre: the error left is of third order."""
+    """20 µm, 3 mrad of phase a micrometre: the error left is of third order."""
     phase = RNG.uniform(-3, 3, 500)
     q = RNG.uniform(-3e-3, 3e-3, 500)
     motion = 20 * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(4)) + 8.0

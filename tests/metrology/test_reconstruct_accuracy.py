@@ -122,7 +122,7 @@ def test_vertex_shift_that_is_known_does_no_harm() -> None:
 
 
 def test_any_pose_with_a_distorting_lens() -> None:
-    """Camera and screen turned, moved and rolled, and 300 um of barrel distortion: the code knows only poses."""
+    """Camera and screen turned, moved and rolled, and 300 µm of barrel distortion: the code knows only poses."""
     rng = np.random.default_rng(4)
     turn = np.linalg.qr(np.eye(3) + 0.02 * rng.normal(size=(3, 3)))[0]
     turn *= np.sign(np.diag(turn))
@@ -205,7 +205,7 @@ def test_weight_zero_leaves_a_point_out() -> None:
 
 
 def test_covariance_is_the_scatter_of_noisy_sets() -> None:
-    """Parameters, and the sag, over 200 sets with 20 um of noise on the screen: to 10 %."""
+    """Parameters, and the sag, over 200 sets with 20 µm of noise on the screen: to 10 %."""
     seen = _seen("bowl", 4)
     points = _points(seen)
     clean: Fit = solve(TRACER, points, START, tolerance_mm=1e-10)

@@ -135,7 +135,7 @@ def test_the_full_result_needs_the_face_and_gets_it() -> None:
         checked = check(stack, optics)
         full = reconstruct_full(optics, checked, measure_pixels(optics, checked))
         errors.append(_error_um(full.surface))
-    assert errors[0] < 0.1  # um: rounding to 8 bits at a 64th of the pixels
+    assert errors[0] < 0.1  # µm: rounding to 8 bits at a 64th of the pixels
     assert errors[1] > 20 * errors[0]
 
 

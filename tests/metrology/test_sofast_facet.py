@@ -90,7 +90,7 @@ def test_robust_fit_of_all_pixels_agrees(golden, seen, camera):
     assert ours.fit.surface.focal_y_mm == pytest.approx(focal_y_mm, rel=8e-4)
     assert ours.fit.surface.curvature_xy_per_mm == pytest.approx(result.coefficients[4] * 1e-3, rel=3e-3)
     difference = ours.slopes - result.slopes
-    assert np.all(np.std(difference, axis=1) < 0.02e-6)  # in shape: 0.02 urad
+    assert np.all(np.std(difference, axis=1) < 0.02e-6)  # in shape: 0.02 µrad
     assert np.abs(difference).max() < 0.8e-6  # with the tilt in which the two fits differ
     np.testing.assert_allclose(np.std(ours.slopes, axis=1), np.std(result.slopes, axis=1), rtol=1e-4)
     np.testing.assert_allclose(ours.points_mm, result.points_mm, atol=1e-3)

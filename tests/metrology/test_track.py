@@ -110,7 +110,7 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
     sigma = frames[0].sag_sigma_um
     assert 0.005 < sigma < 0.05
     assert np.abs(error - error.mean()).max() < 4 * sigma  # the anchor's own error is common
-    change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 um has only m = 0
+    change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 µm has only m = 0
     odd = [j for j in NOLL_INDICES[1:] if noll_orders(j)[1] != 0]
     assert (np.abs(change_um / frames[0].sigma_um)[[j - 1 for j in odd]] < 5 * math.sqrt(2)).all()
 
@@ -322,7 +322,7 @@ def jumps(bench: Bench, count: int, seed: int) -> list[str]:
         found = deepcopy(good).follow(bench.frame(sag_um, film), STILL, 0.05)
         error_um = found.sag_um - 1e3 * bench.scene.surface.sag_mm - sag_um
         if found.verdict != "rejected" and not abs(error_um) < 1.0:
-            silent.append(f"{sag_um:.0f} um, {tilt_mrad:.2f} mrad: {found.verdict}, {error_um:.2f} um off")
+            silent.append(f"{sag_um:.0f} µm, {tilt_mrad:.2f} mrad: {found.verdict}, {error_um:.2f} µm off")
     return silent
 
 

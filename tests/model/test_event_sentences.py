@@ -9,7 +9,7 @@ from membrane_ctrl.model.event_base import KINDS, Event, EventLine
 from membrane_ctrl.model.run_events import from_dict
 
 FAULT = {
-    "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 um",
+    "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 µm",
     "cause": "the bowl is deeper than its limit", "limit": "limits.displacement_max_um", "safe_level": "vent",
     "latching": True, "remedy": "check the laser against a ruler", "crc32": "0",
 }  # fmt: skip
@@ -26,7 +26,7 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
     ("line", "said"),
     [
         ({"kind": "end", "exit": "done"}, "Run ended: done"),
-        ({"kind": "why", "why": "inside +-2 um"}, "Inside ±2 µm"),
+        ({"kind": "why", "why": "inside +-2 µm"}, "Inside ±2 µm"),
         ({"kind": "state", "state": "hold", "from": "settle", "why": ""}, "State hold, from settle"),
         (
             {"kind": "command", "command": "setpoint", "value": 5.0, "who": "ann", "why": "step"},
@@ -42,7 +42,7 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
         ),
         ({"kind": "no_claim", "message": "the board\ncannot"}, "The board cannot"),
         (
-            {"kind": "plausibility", "faulty": "none", "readings": "laser +1.0 um"},
+            {"kind": "plausibility", "faulty": "none", "readings": "laser +1.0 µm"},
             "Laser and camera agree again (laser +1.0 µm)",
         ),
         # not as expected: the fields, whatever they are

@@ -57,7 +57,7 @@ def test_a_key_that_a_line_lacks_is_empty() -> None:
 
 
 def test_the_numbers_of_an_event_do_not_depend_on_its_words() -> None:
-    fault = Fault(21, "over", "deep", "501 um", "limit", "vent", True, "look")
+    fault = Fault(21, "over", "deep", "501 µm", "limit", "vent", True, "look")
     assert fault.numbers() == (21.0, 1.0)
     assert Fault(21, "x", "y", "z", "", "", True, "").numbers() == fault.numbers()
     assert StateEntered("hold", "settle", "inside").numbers() == ()
@@ -79,7 +79,7 @@ def test_codes_come_back_as_their_class_and_count_among_the_numbers() -> None:
 
 
 def test_lists_come_back_as_they_were() -> None:
-    held = HeldBy(("laser", "optics"), ("laser +12 um",))
+    held = HeldBy(("laser", "optics"), ("laser +12 µm",))
     assert from_dict(json.loads(json.dumps(held.to_dict()))) == held
     assert held.sentence == "The mirror is held by laser, optics; jumped: laser +12 µm"
     for sensors in ("laser", [1], {"laser": 1}):

@@ -27,4 +27,4 @@ def test_the_fields_of_a_template() -> None:
 
 
 def test_units_as_people_read_them() -> None:
-    assert for_people("drum um umbrella +-3 um,\n  1 urad") == "drum µm umbrella ±3 µm, 1 µrad"
+    assert for_people("drum µm umbrella +-3 µm,\n  1 µrad") == "drum µm umbrella ±3 µm, 1 µrad"

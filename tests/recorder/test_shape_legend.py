@@ -40,7 +40,7 @@ def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path
         return list(scalars(path, f"/shape/map/{kind}", "DepthImage:depth_range")[1][-1, 0])
 
     low, high = span("difference")
-    assert 9.0 < high == -low < 10.0  # a tilt of 5 um RMS is 10 um at the rim
+    assert 9.0 < high == -low < 10.0  # a tilt of 5 µm RMS is 10 µm at the rim
     assert span("difference_no_tilt") == [-0.5, 0.5]  # nothing left: noise must not fill the colours
     assert span("difference_no_defocus") == pytest.approx([-0.1, 0.1])
     assert span("scatter") == pytest.approx([0.0, high / np.sqrt(2)], rel=1e-3)

@@ -35,7 +35,7 @@ def test_figures_are_those_of_the_summary() -> None:
     for event in (FAULT, run_events.GeometryInForce("0f93", "bench.toml", "2026-11-21", "")):
         summary.add_event(event.to_dict())
     gains = dict(vars(Config().loop)) | {"kp_per_s": 0.8}
-    status = RunStatus(why="inside +-2 um | so far").after_event(
+    status = RunStatus(why="inside +-2 µm | so far").after_event(
         events.CommandTaken("gains", "ann", "", value=60.0, loop=gains), 20.0
     )
     told = page(summary, status)

@@ -32,7 +32,7 @@ def bumped(events: list[Planted], size_um: float, scenario: str = "typical") -> 
 @pytest.mark.parametrize("size_um", [5.0, -5.0])
 def test_an_excursion_without_a_cause_is_named(size_um: float) -> None:
     (found,) = found_in(bumped([], size_um))
-    assert (found.kind, found.unit) == ("excursion", "um")
+    assert (found.kind, found.unit) == ("excursion", "µm")
     assert found.time_s == pytest.approx(AT_S + 5, abs=3.0)
     assert found.size == pytest.approx(-size_um, abs=1.2)
 

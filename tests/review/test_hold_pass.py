@@ -130,7 +130,7 @@ def test_a_flow_that_only_lags_is_not_at_a_limit(tmp_path: Path) -> None:
 
 
 def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> None:
-    """A curve of 10 um/s from a third of the run to two thirds; gains change meanwhile."""
+    """A curve of 10 µm/s from a third of the run to two thirds; gains change meanwhile."""
     rows, _ = night(1, HOURS, "quiet", [])
     rows[:, COLUMN["flow_wanted_um_per_s"]] = 8.0
     write_run(tmp_path / "run", iter([(rows, [])]))

@@ -48,4 +48,4 @@ def test_every_place_shows_the_same_sign(tmp_path: Path, rows: Rows) -> None:
     }
     assert all(value == pytest.approx(SHALLOW_UM, abs=0.2) for value in shown.values()), shown
     assert f"mean {report['true']['windows'][0]['mean_um']:+.3f} µm" in verdict(analysis)[1]
-    assert any(line.endswith(f"{table['true_bias_um']:+.3f} um") for line in _headline(table))
+    assert any(line.endswith(f"{table['true_bias_um']:+.3f} µm") for line in _headline(table))

@@ -24,7 +24,7 @@ RATE_HZ = 10.0
 
 @pytest.fixture(scope="module")
 def rows() -> Rows:
-    """A move, a pause in which the mirror strays by 40 um, and eight seconds without light."""
+    """A move, a pause in which the mirror strays by 40 µm, and eight seconds without light."""
     at = [
         {"time_s": 60.0, "command": "setpoint", "value": 40.0},
         {"time_s": 160.0, "command": "pause"},

@@ -84,7 +84,7 @@ def test_a_real_bench_has_no_true_figures() -> None:
 
 def test_rows_of_a_setpoint_ramp_do_not_count() -> None:
     rows = rows_of(40.0)
-    # target jumps by 100 um at 20 s, the ramp takes until 25 s, the truth follows the ramp
+    # target jumps by 100 µm at 20 s, the ramp takes until 25 s, the truth follows the ramp
     moved = [
         replace(
             row,
@@ -142,7 +142,7 @@ def test_events_and_cycles() -> None:
 def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_recorder() -> None:
     summary = Summary(Config())
     fault = Fault(
-        14, "laser_implausible", "the laser is wrong", "laser +9 um", "limits.x", "hold_flow", False, "look"
+        14, "laser_implausible", "the laser is wrong", "laser +9 µm", "limits.x", "hold_flow", False, "look"
     )
     summary.add_event({"mono_s": 1.0, **fault.to_dict()})
     state = json.loads(json.dumps(encode(summary, _SPECIALS)))

@@ -173,7 +173,7 @@ ramp down, pump off, vent ([faults](faults.md)). A latched fault needs a person.
 ```
 
 **Numbers** (defaults; `membrane-ctrl config explain limits`): films work at 600 Pa; the controller vents above
-750 Pa, the board at its own limit; displacement limits -2000 and +500 um. The pump gives 5.3 um/s or 0.26 Pa/s at
+750 Pa, the board at its own limit; displacement limits -2000 and +500 µm. The pump gives 5.3 µm/s or 0.26 Pa/s at
 most, so that 150 Pa take ten minutes; the controller decides within 20 ms to some seconds ([fault
 matrix](fault-matrix.md)), the board's watchdog within 0.5 s.
 

@@ -71,7 +71,7 @@ def test_centre_per_pascal_and_per_ml_of_gas() -> None:
     after = bench.truth()
     rise_um = after.displacement_um - before.displacement_um
     assert rise_um / (after.gauge_pressure_pa - before.gauge_pressure_pa) == pytest.approx(20.6, abs=0.25)
-    # full flow 5.3 um/s is 5.98 mL/s: 60 s at (0.5 - 0.1)/0.9 of it
+    # full flow 5.3 µm/s is 5.98 mL/s: 60 s at (0.5 - 0.1)/0.9 of it
     added_ml = 60.0 * 0.4 / 0.9 * 5.3 / 0.886
     assert rise_um / added_ml == pytest.approx(0.886, rel=0.003)
 
@@ -136,7 +136,7 @@ def test_leak_doubled() -> None:
 
 # By hand: gas volume c p^(1/3) with c the sum over films, P V constant, so d ln w = d ln J / 3 of the film itself
 # minus k d ln c, k = 1 / (1 + 3p/P) = 0.983. The mirror film has 0.369 of c: (1/3)(1 - 0.369 k) and -(1/3) 0.631 k
-# of 1.01 % of 37.1 mm are 79.2 and -77.0 um (81 and -79 in the design's table need another split than 37.1 : 63.4).
+# of 1.01 % of 37.1 mm are 79.2 and -77.0 µm (81 and -79 in the design's table need another split than 37.1 : 63.4).
 @pytest.mark.parametrize(("softer", "expected_um"), [("MIRROR_FILM", 79.2), ("BACK_FILM", -77.0)])
 def test_one_softer_film_moves_trapped_gas(softer: str, expected_um: float, monkeypatch: pytest.MonkeyPatch) -> None:
     ordinary = getattr(film, softer)
@@ -186,5 +186,5 @@ def test_a_vented_mirror_goes_down_for_good() -> None:
         bench.advance(60.0)
         sags_mm.append(bench.truth().sag_mm)
     assert sags_mm == sorted(sags_mm, reverse=True)
-    # V^2 dV = -const V^3 dt: the last mm take ever longer, sag ~ 1/sqrt(1 + 2 t 100 um/s / 37 mm)
+    # V^2 dV = -const V^3 dt: the last mm take ever longer, sag ~ 1/sqrt(1 + 2 t 100 µm/s / 37 mm)
     assert sags_mm[-1] == pytest.approx(37.1 / math.sqrt(1 + 2 * 3600 * 0.1 / 37.1), rel=0.03)

@@ -140,7 +140,7 @@ def _protections() -> list[str]:
         for sensor in FilmSensor:
             if value is not ProcessValue.OPTICS or sensor is not FilmSensor.LASER:
                 cells = (find_bound(value, sensor, failure, Config()) for failure in Failure)
-                bounds = " | ".join(f"{bound.distance_um:.0f} um ({bound.sensor.value})" for bound in cells)
+                bounds = " | ".join(f"{bound.distance_um:.0f} µm ({bound.sensor.value})" for bound in cells)
                 lines.append(f"| {value.value} | {sensor.value} | {bounds} |")
     return lines
 

@@ -159,7 +159,7 @@ class ForeignPlant:
     def _step(self) -> None:
         gauge_pa = self._gauge()
         out = self._leak_um_per_s * math.sqrt(max(gauge_pa, 0.0) / _PRESSURE_PA) + 90.0 * self._vent
-        # a flow of 1 um/s moves the centre by 1 um/s at the working point
+        # a flow of 1 µm/s moves the centre by 1 µm/s at the working point
         per_um = (_AMBIENT_PA + _PRESSURE_PA + self._stiffness(_SAG_UM) * _SAG_UM) / _AIR_K
         self._gas += per_um * (self.pump.step(self._command) - out) * STEP_S
         self._steps += 1

@@ -17,7 +17,7 @@ STARTED_UTC = datetime(2026, 11, 21, 1, 23, 45, tzinfo=UTC)
 
 
 def rows_of(seconds: float, seed: int = 0, truth: bool = True) -> list[TelemetryRow]:
-    """Standby for 1 s, settle until 6 s, then hold at a target of 10 um."""
+    """Standby for 1 s, settle until 6 s, then hold at a target of 10 µm."""
     rng = np.random.default_rng(seed)
     return [_row(k, rng, truth) for k in range(round(seconds * RATE_HZ))]
 
@@ -71,7 +71,7 @@ def message_of(row: TelemetryRow) -> bytes:
 
 
 def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) -> ShapeEstimate:
-    """A paraboloid 37 mm deep with an astigmatism that grows by 0.02 um/s."""
+    """A paraboloid 37 mm deep with an astigmatism that grows by 0.02 µm/s."""
     rng = np.random.default_rng(seed + cycle)
     coeffs_um = np.zeros(ZERNIKE_TERMS)
     # a paraboloid of 37 mm sag, 0 at the vertex: sag rho^2 = sag (Z4 / sqrt(3) + 1) / 2

@@ -77,7 +77,7 @@ def watched(
     drift_nm: float = 1.0,
     jitter_s: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, list[Planted]]:
-    """Times, terms in um and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
+    """Times, terms in µm and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
 
     Frequencies and shapes are drawn, unless they are a drum's. `jitter_s` is that of the times of the frames.
     """

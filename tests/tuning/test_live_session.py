@@ -51,14 +51,14 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
     assert first["flow_um_per_s"] == pytest.approx([1.2] * 10)
     assert (reader.progress.step, reader.progress.planned_s, reader.progress.done_s) == ("observe", 300.0, 2.0)
     held(log, 1.0, math.nan)
-    log.note("said", "observe: laser noise 1.00 um")
+    log.note("said", "observe: laser noise 1.00 µm")
     log.note("step", "design", planned_s=0.0, after_s=320.0)
     log.note("asks", "apply which?")
     more = reader.read()
     assert more["time_s"][0] == pytest.approx(2.2)
     assert all(math.isnan(value) for value in more["displacement_um"])
     assert reader.progress == Progressed(
-        "design", 0.0, 320.0, 0.0, "apply which?", "", ("observe: laser noise 1.00 um",),
+        "design", 0.0, 320.0, 0.0, "apply which?", "", ("observe: laser noise 1.00 µm",),
         ((0.0, "observe"), (3.0, "design")),
     )  # fmt: skip
     assert reader.read()["time_s"] == []

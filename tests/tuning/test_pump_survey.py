@@ -103,7 +103,7 @@ def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
-    """The spline carried the certainty of no flow at command 0 into the dead zone: 0.3 um/s where there is none."""
+    """The spline carried the certainty of no flow at command 0 into the dead zone: 0.3 µm/s where there is none."""
     pump = ForeignPump("root", 3.1, 0.22, 0.09)
     found, _ = mapped(tmp_path, ForeignPlant(pump, 20, 2.36, 2.1, laser_um=1.34))
     assert worst_share(found, pump) < 0.03
@@ -111,7 +111,7 @@ def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -> None:
-    """The curve began at 0.06 with 0.85 um/s, more than the leak, and the session was told to open the bleed."""
+    """The curve began at 0.06 with 0.85 µm/s, more than the leak, and the session was told to open the bleed."""
     pump = ForeignPump("root", 6.74, 0.45, 1.38)
     found, _ = mapped(tmp_path, ForeignPlant(pump, 141, 0.41, 0.57, laser_um=0.11))
     assert PumpCurve(found.pump).least_flow_um_per_s < 0.2
@@ -120,7 +120,7 @@ def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -
 
 @pytest.mark.campaign
 def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> None:
-    """With the line of the defaults the hold of a pump 15 times its leak swings by 20 um, and was not surveyed."""
+    """With the line of the defaults the hold of a pump 15 times its leak swings by 20 µm, and was not surveyed."""
     pump = ForeignPump("root", 29.4, 0.25, 0.45)
     link, rig, _ = started(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
     pump_trial._calmed(rig, 10.0)
@@ -185,7 +185,7 @@ def test_a_stuck_pump_is_told(
 
 
 def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: float = 0.1) -> PumpSurvey:
-    """A survey that has found these flows at these commands, to 3 % and 0.05 um/s."""
+    """A survey that has found these flows at these commands, to 3 % and 0.05 µm/s."""
     found = PumpSurvey(0.15, runs=[PumpRun(DT_S, *np.zeros((3, 1)))])
     sigmas = [0.03 * flow + 0.05 for flow in flows]
     levels = {Level(f): FlowAt(*at) for f, *at in zip(fractions, flows, sigmas, strict=True)}
@@ -197,7 +197,7 @@ def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: 
 
 
 def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
-    said = "rises from 0.1 um/s at a command of 0.25 to 17.0 um/s at 0.35, and the mirror loses 1.8 um/s: throttle"
+    said = "rises from 0.1 µm/s at a command of 0.25 to 17.0 µm/s at 0.35, and the mirror loses 1.8 µm/s: throttle"
     with pytest.raises(ValueError, match=said):
         survey_of([0.25, 0.35], [0.1, 17.0], 1.8).result()
     with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # what is between may hold it
@@ -237,7 +237,7 @@ def furthest_um(steps: list[PumpStep], full: float, leak: float, delay_s: float)
 @pytest.mark.parametrize("delay_s", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("known", [True, False])
 def test_visits_in_a_row_wait_for_the_gas_of_each_other(delay_s: float, known: bool) -> None:
-    """The next run began while the mirror still sank: three at once lifted it by 12 um."""
+    """The next run began while the mirror still sank: three at once lifted it by 12 µm."""
     full, leak, high = 13.0, 2.7, 0.55
     fractions = [0.1, 0.25, high, 1.0][: 4 if known else 3]
     survey = survey_of(fractions, [full * f for f in fractions], leak, delay_s)
@@ -247,7 +247,7 @@ def test_visits_in_a_row_wait_for_the_gas_of_each_other(delay_s: float, known: b
 
 
 def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
-    """With nothing known to lift it, it was to rise by 21 um at the full command."""
+    """With nothing known to lift it, it was to rise by 21 µm at the full command."""
     survey = survey_of([0.3, 0.6], [1.0, 1.9], 2.3, 1.5)
     assert max(step.duration_s for step in survey.steps() if step.fraction > 0) <= 2.4
     assert max(step.until_um or 0.0 for step in survey.steps()) <= 2.0
@@ -329,7 +329,7 @@ def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(before: float, high:
 
 @pytest.mark.parametrize("late_s", [0.1, 0.9])
 def test_the_guard_of_a_round_knows_how_late_the_pump_is(monkeypatch: pytest.MonkeyPatch, late_s: float) -> None:
-    """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 um."""
+    """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 µm."""
     survey = survey_of([0.2, 0.4], [0.5, 3.5], 1.2, delay_s=late_s)
     monkeypatch.setattr(pump_trial.pump_survey, "PumpSurvey", lambda *given: survey)
     monkeypatch.setattr(pump_trial, "_brought_back", lambda rig: True)
@@ -349,7 +349,7 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(monkeypatch: pytest.Mon
 
 
 def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path) -> None:
-    """From the flow of a moment they carried the mirror 13 um away."""
+    """From the flow of a moment they carried the mirror 13 µm away."""
     pump = ForeignPump("dead zone", 13.1, 1.0, 0.1)
     _, rig, _ = started(tmp_path, ForeignPlant(pump, 3161, 1.0, 2.7, laser_um=0.3))
     for _ in range(3):  # at any moment of the swing
@@ -405,7 +405,7 @@ def test_a_curve_that_ends_near_the_leak_does_not_hold_the_mirror_meanwhile(
 
 @pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
 def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back: bool) -> None:
-    """In strong weather slow gains left it 8 um high for three minutes, and a sound pump was refused."""
+    """In strong weather slow gains left it 8 µm high for three minutes, and a sound pump was refused."""
     own = LoopConfig(kp_per_s=0.5, ti_s=8.0)
     given: list[LoopConfig] = []
 
@@ -460,7 +460,7 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
 
 @pytest.mark.parametrize(
     ("fractions", "flows", "said"),
-    [([0.03, 0.22], [2.4, 4.8], r"to 2\.4 um/s at 0\.03, .* larger by 0\.026"),
+    [([0.03, 0.22], [2.4, 4.8], r"to 2\.4 µm/s at 0\.03, .* larger by 0\.026"),
      ([0.23, 0.42], [12.6, 14.8], "did not come back"),
      ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather")],
 )  # fmt: skip
@@ -547,7 +547,7 @@ def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_
 def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The pump is three times as strong as configured: the leak seems to be 2.2 um/s until there is a curve."""
+    """The pump is three times as strong as configured: the leak seems to be 2.2 µm/s until there is a curve."""
     plant = ForeignPlant(ForeignPump("straight", 15.9), laser_um=0.4, weather=0.3, leak_um_per_s=6.5)
     link, rig, folder = started(tmp_path, plant, rate_hz=10.0)
     true = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 15.9), start_fraction=0.1, stall_fraction=0.1)

@@ -232,7 +232,7 @@ def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder
 def test_the_estimate_is_told_what_the_session_measured(
     done: SessionFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The twin's own numbers; its laser rounds to 0.1 um."""
+    """The twin's own numbers; its laser rounds to 0.1 µm."""
     twin, found = TwinConfig(), session.estimator_of(done)
     assert found["pump_delay_s"] + found["pump_lag_s"] == pytest.approx(twin.pump_delay_s + twin.pump_lag_s, abs=0.04)
     assert found["laser_noise_um"] == pytest.approx(twin.laser_noise_um, rel=0.1)

@@ -158,7 +158,7 @@ def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um:
 def test_the_shape_loop_s_sensitivity_noise_and_time_constant() -> None:
     still = np.zeros(2000)
     levels = [shapes(60, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
-    drift = np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)  # 0.05 um/sqrt(s)
+    drift = np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)  # 0.05 µm/sqrt(s)
     found = evaluate(levels, shapes(2000, 0.0, 37_100.0, 0.3, drift), zernike_projection())
     assert found.agreement == pytest.approx(1.0)
     assert found.scale == pytest.approx(1.0, abs=0.05)

@@ -153,7 +153,7 @@ def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
 
 @pytest.mark.parametrize(("rate_hz", "least_um"), [(50.0, 7.7), (10.0, 5.3)])
 def test_the_guard_keeps_more_in_hand_where_readings_are_few(rate_hz: float, least_um: float) -> None:
-    """White readings of 1 um: three standard deviations of position and coast are never taken for the limit."""
+    """White readings of 1 µm: three standard deviations of position and coast are never taken for the limit."""
     rng = np.random.default_rng(3)
     guard = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
     seen = [guard.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz) for x in rng.standard_normal(5000)]
@@ -225,7 +225,7 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
 @pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0, 100.0])
 @pytest.mark.parametrize("laser_um", [0.3, 1.0, 2.0])
 def test_noise_alone_stops_no_experiment_at_any_rate(rate_hz: float, laser_um: float) -> None:
-    """A sound relay turns the centre at 4.5 um in a limit of 10; two minutes of noise there."""
+    """A sound relay turns the centre at 4.5 µm in a limit of 10; two minutes of noise there."""
     around = quieted(replace(AROUND, laser_um=laser_um), rate_hz)
     guard = ExcursionGuard(Patterned(around, lambda _: 0.0, 1e9, 0.0), around, 0.0, rate_hz)
     noise_um = laser_um * np.random.default_rng(2).standard_normal(round(120 * rate_hz))
@@ -235,15 +235,15 @@ def test_noise_alone_stops_no_experiment_at_any_rate(rate_hz: float, laser_um: f
 
 
 def test_the_noise_kept_in_hand_is_that_of_the_tick_rate() -> None:
-    """4 um of laser noise leave something of 10 um at 50 readings a second (3 x 0.652 x 4), nothing at 25."""
+    """4 µm of laser noise leave something of 10 µm at 50 readings a second (3 x 0.652 x 4), nothing at 25."""
     noisy = replace(AROUND, laser_um=4.0)
     ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=50.0)
-    with pytest.raises(ValueError, match=r"takes 11\.1 um of it at 25 readings/s; give a larger limit"):
+    with pytest.raises(ValueError, match=r"takes 11\.1 µm of it at 25 readings/s; give a larger limit"):
         ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=25.0)
 
 
 def test_after_its_end_an_experiment_brings_the_mirror_back_without_winding_up() -> None:
-    """On a pump that gives little at small commands a loop came back from +8.5 um and went on to -12.9."""
+    """On a pump that gives little at small commands a loop came back from +8.5 µm and went on to -12.9."""
     guard = ExcursionGuard(Constant(), AROUND, 0.0, 50.0)
     at_um, lowest_um, out = 9.5, 9.5, 0.0
     for _ in range(50 * 60):
@@ -267,7 +267,7 @@ def test_a_mirror_that_strays_on_the_way_back_is_given_to_the_loop_and_its_safet
         at_um -= 0.02 * 5.0
         step = guard.step(BenchSample(at_um), 0.02)
     assert -22.0 < at_um < -19.0
-    assert "the limit of 10 um was near" in step.reason
+    assert "the limit of 10 µm was near" in step.reason
 
 
 def test_a_raw_experiment_ends_where_it_is_and_one_without_readings_at_once() -> None:
@@ -277,14 +277,14 @@ def test_a_raw_experiment_ends_where_it_is_and_one_without_readings_at_once() ->
     assert back.step(BenchSample(9.5), 0.02) == 0.0
     lost = [back.step(BenchSample(math.nan), 0.02) for _ in range(20)]
     assert isinstance(lost[-1], Finished)
-    assert "the limit of 10 um was near" in lost[-1].reason
+    assert "the limit of 10 µm was near" in lost[-1].reason
 
 
 def test_what_is_known_of_the_delay_stops_a_moving_mirror_earlier_unless_the_noise_forbids() -> None:
     def stopped_um(laser_um: float, late_s: float) -> float:
         around = quieted(replace(AROUND, laser_um=laser_um, late_s=late_s), 50.0)
         guard = ExcursionGuard(Constant(), around, 0.0, 50.0)
-        way_um = np.arange(0.0, 10.0, 0.06)  # 3 um/s
+        way_um = np.arange(0.0, 10.0, 0.06)  # 3 µm/s
         return next(float(x) for x in way_um if guard.step(BenchSample(float(x)), 0.02) != Constant.FLOW_UM_PER_S)
 
     assert stopped_um(0.1, 0.9) < stopped_um(0.1, 0.4) - 1.2

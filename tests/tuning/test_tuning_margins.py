@@ -102,7 +102,7 @@ def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() ->
 
 
 def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
-    """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 um after 4.3 s; without gain never."""
+    """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 µm after 4.3 s; without gain never."""
     model = PlantModel(1.0, 0.0, 0.0, 1.0)
     assert load_step(Gains(1.0, 4.0), model, 1.0, 1e-9).recovery_s == pytest.approx(4.31, abs=0.1)
     assert load_step(Gains(1e-6, 1e6), model, 1.0, 1e-9).recovery_s == math.inf
@@ -123,7 +123,7 @@ def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
 
 @pytest.mark.parametrize(("name", "known"), [("ziegler-nichols", False), ("simc", True)])
 def test_what_a_pump_that_only_switches_would_do_is_not_known(name: str, known: bool) -> None:
-    """Ziegler-Nichols has no filter: its flow would swing by 140 um/s, and 6.6 um were predicted where 0.9 came."""
+    """Ziegler-Nichols has no filter: its flow would swing by 140 µm/s, and 6.6 µm were predicted where 0.9 came."""
     loop = LoopConfig()
     gains = designs(PUMP, typical(loop), loop, Demands())[name]
     row = candidate(name, gains, PUMP, typical(loop), loop, Demands())

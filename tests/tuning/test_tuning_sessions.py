@@ -19,19 +19,19 @@ from tuning.proposal.prediction import ModelBench, preview
 from tuning.rig import Rig
 
 RATIO_MAX = {
-    "quiet, 1 um": 1.15,
-    "typical, 1 um": 1.15,
-    "gusty, 1 um": 1.5,
-    "quiet, 0.3 um": 1.25,
-    "typical, 0.3 um": 1.25,
+    "quiet, 1 µm": 1.15,
+    "typical, 1 µm": 1.15,
+    "gusty, 1 µm": 1.5,
+    "quiet, 0.3 µm": 1.25,
+    "typical, 0.3 µm": 1.25,
 }
 
 
 @pytest.mark.parametrize(
     ("name", "rules"),
     [
-        ("typical, 1 um", False),
-        *(pytest.param(name, name == "typical, 1 um", marks=pytest.mark.campaign) for name in RATIO_MAX),
+        ("typical, 1 µm", False),
+        *(pytest.param(name, name == "typical, 1 µm", marks=pytest.mark.campaign) for name in RATIO_MAX),
     ],
 )
 def test_a_session_reaches_what_it_must(name: str, rules: bool) -> None:
@@ -53,7 +53,7 @@ def test_a_session_reaches_what_it_must(name: str, rules: bool) -> None:
 @pytest.mark.campaign
 def test_with_weather_sensors_and_bleed_it_beats_the_laser_alone() -> None:
     laser_only_least_um = 0.149
-    figures = session(SESSIONS["typical, 1 um, barometer, thermometer, bleed doubled"], 3)
+    figures = session(SESSIONS["typical, 1 µm, barometer, thermometer, bleed doubled"], 3)
     assert figures["ours_um"] < 0.7 * laser_only_least_um
     assert 0.7 < figures["predicted_over_achieved"] < 1.3
 

@@ -190,7 +190,7 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
         assert [(each.kind, each.text) for each in run.asked] == [("mark", "shut"), ("stop", "")]
 
 
-CANDIDATES = """| candidate | K 1/s | std um | Ms | against present |
+CANDIDATES = """| candidate | K 1/s | std µm | Ms | against present |
 |---|---:|---:|---:|---:|
 | present | 0.300 | 0.210 +- 0.010 | 1.35 | in force |
 | least-variance | 0.520 | 0.130 +- 0.008 | 1.58 | better: std x 0.62; worse: Ms x 1.17 |
@@ -208,7 +208,7 @@ async def test_a_candidate_is_chosen_on_the_page(tmp_path: Path, monkeypatch: py
     progress = Progress()
     progress.log = LiveLog(path, 50.0, print)
     progress.note("step", "design", planned_s=0.0, after_s=600.0)
-    progress.say("design: K 0.520 1/s, Ti 2.10 s: std 0.210 -> 0.130 um")
+    progress.say("design: K 0.520 1/s, Ti 2.10 s: std 0.210 -> 0.130 µm")
     keyboard, terminal = os.openpty()  # nobody types
     with os.fdopen(keyboard), os.fdopen(terminal) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)

@@ -42,7 +42,7 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             assert said == Outcome.succeeded("pause")
             assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: anna")]
             refused = await asyncio.to_thread(feed.ask, {"do": "setpoint", "value": 1e9})
-            assert refused.text.startswith("setpoint refused: setpoint 1e+09 um is outside the limits")
+            assert refused.text.startswith("setpoint refused: setpoint 1e+09 µm is outside the limits")
             run.port.told(Mark("door <b>opened</b>", "anna"))
             await until(lambda: any("door" in line for line in feed.seen.events))
             assert [text for _, text in feed.marks] == ["door <b>opened</b>"]

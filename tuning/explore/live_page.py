@@ -45,11 +45,11 @@ class LivePage:
 
     def _plots(self) -> list[plotting.figure]:
         centre = plotting.figure(
-            title="centre (blue) and setpoint (grey)", y_axis_label="um", height=300, width=_WIDTH,
+            title="centre (blue) and setpoint (grey)", y_axis_label="µm", height=300, width=_WIDTH,
             tools="pan,box_zoom,wheel_zoom,reset,save",
         )  # fmt: skip
         flow = plotting.figure(
-            title="flow", x_axis_label="minutes of hold", y_axis_label="um/s", height=180, width=_WIDTH,
+            title="flow", x_axis_label="minutes of hold", y_axis_label="µm/s", height=180, width=_WIDTH,
             x_range=centre.x_range, tools="",
         )  # fmt: skip
         for plot, names in ((centre, ("setpoint_um", "displacement_um")), (flow, ("flow_um_per_s",))):

@@ -5,7 +5,7 @@ rest is the weather and the laser's noise. Its increments have the spectrum (per
 
     |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
 
-r: laser noise (um^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
+r: laser noise (µm^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
 through the film, tau = 12 s (air temperature), s_i: movement of any other colour, for weather is no random walk at
 all frequencies and the standard deviation of a loop depends on those about its bandwidth. The tau_i stand in
 equal ratios; log s_i bends little from one to the next, so that the spectrum goes on as it was where noise hides it.
@@ -29,8 +29,8 @@ from tuning.identification.loop_model import Record, Series
 
 # Slower motion does not matter to the loop, and weather is no longer a random walk.
 SLOWEST_S = 100.0
-_FLOOR = 1e-12  # um^2: stands for a zero intensity
-_LARGEST = 1e9  # um^2/s: the film would burst
+_FLOOR = 1e-12  # µm^2: stands for a zero intensity
+_LARGEST = 1e9  # µm^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
 _COLOUR_RATIO = 2.0  # of neighbouring tau_i, from the sample time to the slowest
 # of first and second differences of log s_i: a spectrum falls with the square of the frequency, more or less, and
@@ -77,7 +77,7 @@ class Noise:
 
 
 def undriven_um(record: Record, model: loop_model.PlantModel) -> Series:
-    """z: the readings without the effect of pump and mean leak, (n,) um."""
+    """z: the readings without the effect of pump and mean leak, (n,) µm."""
     driven = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     return record.filled_displacement_um() - model.gain * driven
 
@@ -166,7 +166,7 @@ _BLOCK_S = 0.5  # with shorter blocks a barometer's noise hides its signal; long
 class WeatherGain:
     """A gain, its standard error, and the random walk of the sensor's quantity."""
 
-    gain: float  # um per Pa or um per K
+    gain: float  # µm per Pa or µm per K
     sigma: float
     walk: float  # variance per second of the quantity's random walk, Pa^2/s or K^2/s
     noise: float  # standard deviation of a reading
@@ -279,7 +279,7 @@ class DisturbanceModel:
         return self.rest.white
 
     def psd(self, w_rad_per_s: Series, model: loop_model.PlantModel, loop: LoopConfig) -> Series:
-        """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, um^2 s.
+        """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, µm^2 s.
 
         The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H), with H the pump
         behind the feed-forward's filter; the sensor's noise comes in through H.
@@ -295,7 +295,7 @@ class DisturbanceModel:
         return np.asarray(total, dtype=float)
 
     def feedforward_psd(self, w_rad_per_s: Series, loop: LoopConfig) -> Series:
-        """Two-sided spectrum of the flow that the loop's feed-forward asks for, (um/s)^2 s."""
+        """Two-sided spectrum of the flow that the loop's feed-forward asks for, (µm/s)^2 s."""
         total = np.zeros_like(w_rad_per_s)
         for weather, used, gain, filter_s in self._channels(loop):
             rate = gain * w_rad_per_s / np.abs(1 + 1j * w_rad_per_s * filter_s) if used else 0.0

@@ -84,7 +84,7 @@ class Identified:
 def prediction_errors(
     record: loop_model.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
 ) -> loop_model.Series:
-    """One-step prediction errors of a model on a record, (n - 1,) um; the first ones include the filter's start-up.
+    """One-step prediction errors of a model on a record, (n - 1,) µm; the first ones include the filter's start-up.
 
     `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
     """

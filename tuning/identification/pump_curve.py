@@ -55,7 +55,7 @@ class PumpRun:
 
 @dataclass(frozen=True, slots=True)
 class FlowAt:
-    """Flow at a command, um/s, and its standard error."""
+    """Flow at a command, µm/s, and its standard error."""
 
     flow_um_per_s: float
     sigma_um_per_s: float
@@ -291,7 +291,7 @@ def _without_own(
     """Products of a run's columns levels, leak, pressure, delay, lag, height, after what belongs to this run alone.
 
     These are the course of the leak, what the pump gave before the run, and the noise of the first reading. Also the
-    logarithm of their determinant. Noises: of a reading in um, of the leak in um/s.
+    logarithm of their determinant. Noises: of a reading in µm, of the leak in µm/s.
     """
     paths, leak, rest = np.split(columns, (-4 - nodes, -4), axis=1)
     levels, before = paths[:, :-1], paths[:, -1:]

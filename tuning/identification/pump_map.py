@@ -33,7 +33,7 @@ _CLEAR = 3.0  # standard errors: a flow beyond doubt
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """Flows in um/s of the commands reached from below, or of those from above, arrays (n,)."""
+    """Flows in µm/s of the commands reached from below, or of those from above, arrays (n,)."""
 
     fractions: FloatArray
     flows: FloatArray
@@ -50,7 +50,7 @@ NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class PumpMap:
-    """`pump_map.json`: what was measured. Flows in um/s."""
+    """`pump_map.json`: what was measured. Flows in µm/s."""
 
     fraction: tuple[float, ...]  # levels reached from below
     flow_um_per_s: tuple[float, ...]
@@ -65,7 +65,7 @@ class PumpMap:
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """What a survey has found so far. Flows in um/s."""
+    """What a survey has found so far. Flows in µm/s."""
 
     fit: PumpFit
     rising: Branch  # levels reached from below, from no flow at command 0
@@ -85,7 +85,7 @@ class Surveyed:
         leak, full = self.fit.leak_um_per_s, float(rising.flows[-1])
         if full < leak:
             raise ValueError(
-                f"the pump gives {full:.2f} um/s at most and the mirror loses {leak:.2f} um/s: find the leak, or "
+                f"the pump gives {full:.2f} µm/s at most and the mirror loses {leak:.2f} µm/s: find the leak, or "
                 "take a stronger pump, then run `tune pump` again"
             )
         start, above = first_jump(rising, full), self.falling.columns
@@ -141,7 +141,7 @@ class Surveyed:
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if stuck(self.fit, self.rising):
             raise ValueError(
-                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} um/s more at "
+                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} µm/s more at "
                 f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
                 "`tune pump` again"
             )
@@ -176,8 +176,8 @@ class Surveyed:
         below = above - 1
         if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
             raise ValueError(
-                f"{said}: the flow rises from {flows[below]:.1f} um/s at a command of {fractions[below]:.2f} to "
-                f"{flows[above]:.1f} um/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} um/s: throttle "
+                f"{said}: the flow rises from {flows[below]:.1f} µm/s at a command of {fractions[below]:.2f} to "
+                f"{flows[above]:.1f} µm/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} µm/s: throttle "
                 f"the pump, or {bleed_open(leak, flows[above])}, then run `tune pump` again"
             )
 

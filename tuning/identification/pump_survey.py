@@ -137,7 +137,7 @@ class PumpSurvey:
         return self.sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
 
     def sigma(self, level: Level) -> float:
-        """Standard error of its flow in um/s, with what its neighbours tell; infinite for one not visited."""
+        """Standard error of its flow in µm/s, with what its neighbours tell; infinite for one not visited."""
         branch = self._branches[level.rising]
         at = np.flatnonzero(branch.fractions == level.fraction)
         return float(branch.sigmas[at[0]]) if at.size else math.inf

@@ -2,7 +2,7 @@
 
 A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over it is the
 sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held, the deflectometry's noise and
-the drift between the two: white noise of sigma a cycle of length T, and a random walk of q um/sqrt(s). The best
+the drift between the two: white noise of sigma a cycle of length T, and a random walk of q µm/sqrt(s). The best
 time constant between them is (docs/physics.md, shape loop)
 
     tau = sigma sqrt(T) / q.
@@ -89,10 +89,10 @@ _CYCLES_MIN, _TAU_MAX_S = 10.0, 3600.0
 class ShapeLoopFit:
     """Result of the fit."""
 
-    sensitivity: Series  # (terms,): change of the coefficients per um of sag, and standard errors
+    sensitivity: Series  # (terms,): change of the coefficients per µm of sag, and standard errors
     sensitivity_sigma: Series  # (terms,)
     agreement: float  # cosine between it and the one assumed, piston left out; 1 is the same direction
-    scale: float  # sag by deflectometry per um of laser reading
+    scale: float  # sag by deflectometry per µm of laser reading
     sigma_um: float  # noise of a cycle
     cycle_s: float  # between results
     drift_um_per_sqrt_h: float  # between laser and deflectometry
@@ -204,7 +204,7 @@ def trial(
     if len(during) < _LEAST_CYCLES or tracking < _TRACKING_LEAST:
         reason = f"the shape loop tracked only {tracking:.0%} of the trial, with {len(during)} shapes"
     elif error_um > GROWTH_MAX * error_before_um:
-        reason = f"the next shape is predicted to {error_um:.2f} um, by the former one to {error_before_um:.2f} um"
+        reason = f"the next shape is predicted to {error_um:.2f} µm, by the former one to {error_before_um:.2f} µm"
     if reason:
         rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)
     else:

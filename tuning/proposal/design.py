@@ -217,7 +217,7 @@ def propose(
     model = identified.model
     if not 0 < model.holding_flow_um_per_s < pump.flow_full_um_per_s:
         raise RefusedError(
-            f"the leak of {model.leak_um_per_s:.2f} um/s is outside what the pump can hold: "
+            f"the leak of {model.leak_um_per_s:.2f} µm/s is outside what the pump can hold: "
             "open the bleed or find the leak, then repeat"
         )
     settled = feedforward_settings(loop, disturbance)
@@ -247,8 +247,8 @@ def propose(
     )
 
 
-HEADS = ("candidate", "K 1/s", "Ti s", "filter s", "std um", "load peak um", "recovery s", "Ms", "against present")
-MARGIN_HEADS = ("Td s", "/ least", "flow std um/s", "GM", "PM deg", "delay margin s", "disk margin")
+HEADS = ("candidate", "K 1/s", "Ti s", "filter s", "std µm", "load peak µm", "recovery s", "Ms", "against present")
+MARGIN_HEADS = ("Td s", "/ least", "flow std µm/s", "GM", "PM deg", "delay margin s", "disk margin")
 _WORDS = {"std_um": "std", "load_peak_um": "load peak", "load_recovery_s": "recovery", "ms": "Ms"}
 _DIGITS = {"std_um": 3, "load_peak_um": 2, "load_recovery_s": 1, "ms": 2}
 _ALIKE = 0.02  # a smaller change is none
@@ -280,7 +280,7 @@ def shown(rows: tuple[Candidate, ...], title: str, leak_um_per_s: float) -> Grou
         words.add_row(line[0], line[-1])
     step = rules.Demands().load_step_um_per_s
     caption = (
-        f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} um/s. "
+        f"Load peak and recovery: after the leak grows from {leak_um_per_s:.2f} to {leak_um_per_s + step:.2f} µm/s. "
         "+-: 1 sigma of the fit; for std with ten other minutes of weather like the observed, which change every std "
         "alike."
     )

@@ -62,7 +62,7 @@ def limited(
     loop: LoopConfig,
     w: FloatArray,
 ) -> tuple[loop_model.PlantModel, FloatArray]:
-    """The plant as a pump with limits drives it, and the spectrum of the centre without feedback at `w`, um^2 s.
+    """The plant as a pump with limits drives it, and the spectrum of the centre without feedback at `w`, µm^2 s.
 
     The pump gives no less than nothing and no more than `loop.flow_max_um_per_s`. Statistical linearisation (Gelb and
     Vander Velde, Multiple-Input Describing Functions, 1968, chapter 7): of a flow that swings like a Gaussian, the
@@ -130,7 +130,7 @@ def least_std_um(
 
 # A walk that returns after an hour is equivalent for the loop, and bounds what the laser cannot distinguish.
 _RETURN_S = 3600.0
-# Intensity of an unseen walk, um^2/s: 1 nm in a second; zero would leave the filter without a solution.
+# Intensity of an unseen walk, µm^2/s: 1 nm in a second; zero would leave the filter without a solution.
 _UNSEEN = 1e-6
 
 
@@ -222,7 +222,7 @@ class _Driven:
 class ModelBench:
     """A simulated bench made from the identified models; equal seeds give equal weather.
 
-    `leak_step` has the time in s and the size in um/s of a step of the leak.
+    `leak_step` has the time in s and the size in µm/s of a step of the leak.
     """
 
     def __init__(

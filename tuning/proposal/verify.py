@@ -147,7 +147,7 @@ def look(record: Record, setpoint_um: Series, trial: VerificationTrial, growth_m
     ms = seen_sensitivity(off_um, trial, weather) if replayed else math.nan
     reason = ""
     if growth > growth_max:
-        reason = f"the standard deviation is {std_um:.3f} um, {growth:.2f} times that of the previous gains"
+        reason = f"the standard deviation is {std_um:.3f} µm, {growth:.2f} times that of the previous gains"
     elif ms > MS_MAX:
         reason = f"the readings show a sensitivity of {ms:.1f} (limit {MS_MAX:g}): less margin than designed"
     return Stage(record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason)
@@ -195,7 +195,7 @@ def health(record: Record, setpoint_um: Series, loop: LoopConfig, made: GainsFil
         ratio = std_um / (designed * least_um)
         found.append(f"the centre moves {ratio:.1f} times as much as these gains should allow")
     if abs(leak_um_per_s - model.leak_um_per_s) > _LEAK_CHANGE * model.leak_um_per_s:
-        found.append(f"the leak is {leak_um_per_s:.2f} um/s, formerly {model.leak_um_per_s:.2f} um/s")
+        found.append(f"the leak is {leak_um_per_s:.2f} µm/s, formerly {model.leak_um_per_s:.2f} µm/s")
     spread = math.hypot(gain_sigma, made.plant.gain_sigma)
     if abs(gain - model.gain) > max(_K_SIGMAS * spread, _K_CHANGE * model.gain):
         found.append(f"k is {gain:.2f} +- {gain_sigma:.2f}, formerly {model.gain:.2f}")

@@ -80,7 +80,7 @@ class Experiment(Protocol):
     """A step machine."""
 
     def step(self, measurement: BenchSample, dt_s: float) -> float | Finished:
-        """Flow in um/s until the next reading, or the end."""
+        """Flow in µm/s until the next reading, or the end."""
 
 
 @dataclass(slots=True)
@@ -127,7 +127,7 @@ class CentreMotion:
         return (self.memory.fast.value - self.memory.slow.value) / (self._slow_s - self._fast_s)
 
     def noise_per_laser_um(self, rate_hz: float) -> float:
-        """Standard deviation of position + `coast_s` x speed for readings of 1 um.
+        """Standard deviation of position + `coast_s` x speed for readings of 1 µm.
 
         It is sigma sqrt(dt / (2 T)) behind a lag.
         """
@@ -198,7 +198,7 @@ class ExcursionGuard:
         in_hand_um = _IN_HAND_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
             raise ValueError(
-                f"limit of {around.limit_um:g} um: the laser's noise alone takes {in_hand_um:.1f} um of it at "
+                f"limit of {around.limit_um:g} µm: the laser's noise alone takes {in_hand_um:.1f} µm of it at "
                 f"{rate_hz:g} readings/s; give a larger limit, or a faster or quieter laser"
             )
         self._bound_um = around.limit_um - in_hand_um
@@ -230,8 +230,8 @@ class ExcursionGuard:
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
                 ExperimentEnd.STOPPED_BY_GUARD,
-                f"stopped at {off_um:+.1f} um, moving at {self._motion.speed_um_per_s:+.1f} um/s: the limit of "
-                f"{self._limit_um:g} um was near; something else moved the mirror, or the pump is much stronger "
+                f"stopped at {off_um:+.1f} µm, moving at {self._motion.speed_um_per_s:+.1f} µm/s: the limit of "
+                f"{self._limit_um:g} µm was near; something else moved the mirror, or the pump is much stronger "
                 "than configured",
             )
         return self._experiment.step(measurement, dt_s)
@@ -246,7 +246,7 @@ class PatternState(StateNode):
 
 
 class Patterned:
-    """A flow that follows a pattern (s to um/s) about the holding flow, with a weak pull back to where it began.
+    """A flow that follows a pattern (s to µm/s) about the holding flow, with a weak pull back to where it began.
 
     The pull is needed because the holding flow is never known exactly and the mirror integrates the difference; it is
     too slow to disturb the pattern, and harmless to the identification, which knows the flow.
@@ -285,8 +285,8 @@ def room(around: Around) -> tuple[float, float]:
     down = around.holding_flow_um_per_s - around.least_flow_um_per_s
     if min(up, down) <= 0:
         raise ValueError(
-            f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} um/s in the pump's range of "
-            f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} um/s: "
+            f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} µm/s in the pump's range of "
+            f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} µm/s: "
             + (bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s) if down <= 0 else "find the leak")
         )
     return up, down
@@ -296,7 +296,7 @@ def bleed_open(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
     """What to do where a mirror loses too little gas for the least flow of its pump."""
     more_um_per_s = max(0.3, 1.5 * least_um_per_s - loss_um_per_s)
     share = more_um_per_s / gas.VENT_FULL_UM_PER_S
-    return f"open the bleed by {more_um_per_s:.1f} um/s (loop.bleed_fraction larger by {share:.3f})"
+    return f"open the bleed by {more_um_per_s:.1f} µm/s (loop.bleed_fraction larger by {share:.3f})"
 
 
 # Bounded asymmetric relay about the holding flow.
@@ -310,7 +310,7 @@ OVERSHOOT_SHARE = 0.2
 _GROWTH = 1.6
 _FIRST_MAX_UM_PER_S = 1.5
 _OVERSHOOT_LEAST_UM = 0.2  # smaller ones are noise
-# A half cycle of 5 um takes this long if leak + bleed are 0.06 um/s, where no mirror can be held.
+# A half cycle of 5 µm takes this long if leak + bleed are 0.06 µm/s, where no mirror can be held.
 _PATIENCE_S = 90.0
 
 
@@ -386,7 +386,7 @@ class Relay:
             way = "rise" if memory.rises else "sink"
             open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
             remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
-            still = f"the mirror did not {way} by {self._threshold_um:g} um in {_PATIENCE_S:g} s: {remedy}"
+            still = f"the mirror did not {way} by {self._threshold_um:g} µm in {_PATIENCE_S:g} s: {remedy}"
             return Finished(ExperimentEnd.NO_RESPONSE, still)
         half = memory.up if memory.rises else memory.down
         return around.within(around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s)

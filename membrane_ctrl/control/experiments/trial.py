@@ -36,7 +36,7 @@ class ExperimentSpec(Section):
     """A named, bounded experiment about the holding flow.
 
     What the bounds are for: half an hour of a person's time; an excursion that the safety table's following error
-    (60 um) never sees; flows that a film pump can have.
+    (60 µm) never sees; flows that a film pump can have.
     """
 
     version: Literal[1] = 1
@@ -93,7 +93,7 @@ class PumpSteps:
         return self.memory.in_step_s > now.duration_s
 
 
-# Flows in time for `Patterned`, sized so that the mirror stays within a few um. Each takes the identified gain: the
+# Flows in time for `Patterned`, sized so that the mirror stays within a few µm. Each takes the identified gain: the
 # same excursion on a strong and a weak pump.
 
 Pattern = Callable[[float], float]

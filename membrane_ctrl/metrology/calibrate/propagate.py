@@ -155,10 +155,10 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
     total = float(np.mean(moved_um**2))
     if total < _NOTHING_UM**2:
         return "nothing that a figure shows"
-    kept = f"; {np.sqrt(np.mean(figure_um**2)):.2g} um RMS of figure"
+    kept = f"; {np.sqrt(np.mean(figure_um**2)):.2g} µm RMS of figure"
     if 1 - float(np.mean(figure_um**2)) / total > _MOSTLY:
         slope = np.linalg.lstsq(plane, moved_um, rcond=None)[0][1:]
-        return f"a tilt of the surface by {np.hypot(*slope):.2g} um at the rim{kept}"
+        return f"a tilt of the surface by {np.hypot(*slope):.2g} µm at the rim{kept}"
     x, y = plane[:, 1], plane[:, 2]
     surface = solution.states[index].surface.parameters
     height, by_x, by_y = (part.T @ surface for part in residuals.basis(x, y))
@@ -166,7 +166,7 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
         share = (moved_um @ field) ** 2 / (field @ field) / (moved_um @ moved_um)
         if share > _MOSTLY:
             return f"{name}{kept}"
-    return f"a change of figure of {np.sqrt(np.mean(figure_um**2)):.2g} um RMS"
+    return f"a change of figure of {np.sqrt(np.mean(figure_um**2)):.2g} µm RMS"
 
 
 # What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
@@ -176,7 +176,7 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
 # The bowl has the figure of a film that is clamped by hand: a smooth one would claim a fifth more.
 
 _MOUNTED_MM = np.zeros(PARAMETERS)
-_MOUNTED_MM[[3, 5, 7]] = 0.3, 0.1, 0.05  # astigmatism, coma, trefoil; and 10 um RMS over the terms above
+_MOUNTED_MM[[3, 5, 7]] = 0.3, 0.1, 0.05  # astigmatism, coma, trefoil; and 10 µm RMS over the terms above
 _HIGHER = np.arange(9, PARAMETERS - 1)  # Noll 11 and all terms above
 _MOUNTED_MM[_HIGHER] = 0.01 / np.sqrt(_HIGHER.size) * (-1.0) ** np.arange(_HIGHER.size)
 _ACROSS = 48  # rays along the picture's longer side; twice as many change a claim by less than a fiftieth

@@ -7,7 +7,7 @@ and any subset of the sets, and any choice of free parameters, can be solved aga
 
 Each set adds two more observations to the same matrix. The ring does not move: the harmonics 0..7 of the height of
 the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The laser gives the
-vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in um.
+vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in µm.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 RING = 2 * ZERNIKE_DEGREE + 1  # harmonics of the rim: a constant, cosines and sines up to the degree
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 # The film as a check of the geometry. Its round terms beyond the fit's are a micrometre of a 37 mm bowl, and a
-# nanometre of them is 10 um of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever
+# nanometre of them is 10 µm of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever
 # slackness the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
@@ -267,7 +267,7 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     form, (vertex, still) = rows[2:], rows[:2]
     surface, origin = state.surface, np.zeros(1)
     form[:, terms] = np.eye(len(terms))[2:]
-    # the tilt at the vertex is the surface's own, and its form follows: 5 um of coma for a milliradian
+    # the tilt at the vertex is the surface's own, and its form follows: 5 µm of coma for a milliradian
     leans = np.stack([part[:, 0] for part in residuals.basis(origin, origin)[1:]]) / surface.radius_mm
     tilt = leans @ surface.parameters
     here = artefact.terms_mm(*tilt)

@@ -23,7 +23,7 @@ _SLOPE_OFF = 0.2
 _LASER_SIGMAS = 10.0  # of one reading: below, the fringes are as likely to be wrong
 _FEW_POINTS = 500  # of a set: ten times its unknowns
 _SCATTER = 3.0  # times the others' noise
-# with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 um
+# with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 µm
 _HARMLESS_UM = 2.5
 # a correction leaves some hundredths of the motion: in a blurred picture more than the noise
 _STEADY_UM = 4.0
@@ -50,7 +50,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
         if problem.with_artefact:
             return ()  # the artefacts add what the film does not
         says = (
-            f"the sets are only {max(spread_um, seen_um):.0f} um apart: they add nothing to one of them; "
+            f"the sets are only {max(spread_um, seen_um):.0f} µm apart: they add nothing to one of them; "
             f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
         return (CalibrationFinding(True, says),)
@@ -60,7 +60,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     if slope < 0:
         return (CalibrationFinding(True, "the laser counts the wrong way: its reading falls as the bowl deepens"),)
     if abs(slope - 1) > _SLOPE_OFF:
-        says = f"its readings are {spread_um:.4g} um apart, the sags {seen_um:.4g} um"
+        says = f"its readings are {spread_um:.4g} µm apart, the sags {seen_um:.4g} µm"
         return (CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),)
     return ()
 
@@ -104,7 +104,7 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
         return replace(max(causes, key=lambda each: each[0])[1], sets=())
     most = sets[max(moved, key=lambda k: sets[k].moved_um)]
     says = (
-        f"the film moved by {most.moved_um:.0f} um RMS while {most.name} was taken: hold it still, and take it anew"
+        f"the film moved by {most.moved_um:.0f} µm RMS while {most.name} was taken: hold it still, and take it anew"
     )
     return CalibrationFinding(True, says, tuple(moved))
 
@@ -215,7 +215,7 @@ def _why(solution: Solution, index: int) -> str:
     moved_um = phases.displacement_um - solution.problem.references.reference_um
     miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
     if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
-        return f"its laser reads {miss_um:+.1f} um against the optics"
+        return f"its laser reads {miss_um:+.1f} µm against the optics"
     return "its fringes show another bench"
 
 
@@ -232,7 +232,7 @@ def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     laser = diagnose.laser_scale(solution)
     if not laser.sure:
         return []
-    says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} um per um of it"
+    says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm per µm of it"
     return [(laser.fall - 2, CalibrationFinding(True, says))]
 
 
@@ -246,7 +246,7 @@ def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     also = f" (or {', '.join(other.name for other in others)})" if others else ""
     says = (
         f"the residuals have the pattern of {first.name} = {first.value:.3g} +- {first.sigma:.2g}{unit} "
-        f"({parameter.says}){also}, {first.figure_um:.1f} um of figure: free it with --free {first.name}"
+        f"({parameter.says}){also}, {first.figure_um:.1f} µm of figure: free it with --free {first.name}"
     )
     return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
 
@@ -277,7 +277,7 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
 CYCLES = 60  # two minutes of cycles
 GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
 FINE = 1.1  # times the expected residual: a warning ends here
-# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 um and bends the figure by 4
+# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the figure by 4
 RING_MOVED_UM = 5.0
 RING_BACK_UM = 3.0
 
@@ -310,7 +310,7 @@ class DriftMonitor:
             self.says = ""
         elif ratio > GROWN and not self.says:
             self.says = (
-                f"calibrate again: the fit leaves {now_urad:.2f} urad of slope, "
+                f"calibrate again: the fit leaves {now_urad:.2f} µrad of slope, "
                 f"the calibrated geometry predicts {now_urad / ratio:.2f}"
             )
 
@@ -339,6 +339,6 @@ class RingMonitor:
             self.says = ""
         elif moved_um > RING_MOVED_UM and not self.says:
             self.says = (
-                f"calibrate again: the ring is seen {moved_um:.1f} um RMS from where it was when the geometry was "
+                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was when the geometry was "
                 "calibrated; camera or screen has moved"
             )

@@ -34,7 +34,7 @@ _FEWEST_BINS, _ENOUGH_BINS = 1_000, 15_000  # fewer show nothing, more only cost
 _TURNS = 3  # the last one changes the largest bands by a thousandth
 _SINGULAR = 1e-3  # share of the largest eigenvalue below which amplitudes are not determined, and stay
 _NONE = np.zeros(0)
-_GREAT = 0.05  # a twentieth of what bands do is left: 0.1 um of figure from here on
+_GREAT = 0.05  # a twentieth of what bands do is left: 0.1 µm of figure from here on
 _UNEXPLAINED = 0.05  # of bands, times the share that they leave of the rest: those of wrong pictures explain little
 
 

@@ -5,7 +5,7 @@ brightness, contrast and film position. For a sinusoid with predicted phase psi 
 
     I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi + c4 cos 4 psi - b e (q - <q>) sin psi]
 
-with g the bin's light and q its known change of phase per um of film motion: linear in m, b cos delta, b sin delta,
+with g the bin's light and q its known change of phase per µm of film motion: linear in m, b cos delta, b sin delta,
 b e, c2, c3 and c4. The harmonics are the display's response, alike in all frames. A Gray frame has two levels,
 I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noise does not matter; what is left over
 does not belong there.
@@ -25,7 +25,7 @@ _SAMPLE = 6_000
 # For the film's places, whose noise would be taken for motion: as many pixels, whatever the size of the bins
 _SAMPLED_PX = 96_000
 _SEVERAL_RAD = 6.0  # standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
-# Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred um, stay inside
+# Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay inside
 _EDGE_RAD = 0.5
 
 
@@ -36,7 +36,7 @@ class SampledBins:
     index: IntArray  # (n,): bins
     light: FloatArray  # (n,): brightness, see `view`
     phase_rad: FloatArray  # (2, n): predicted absolute phase, film at its mean displacement
-    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per um of displacement
+    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per µm of displacement
 
     def thinned(self, enough: int = _SAMPLE) -> "SampledBins":
         """Enough of the bins."""
@@ -81,7 +81,7 @@ def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list
 def light_and_film(
     stack: FrameStack, binned: Binned, scene: SampledBins, used: tuple[list[int], list[int]], phase_rad: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's places, 1 sigma, um.
+    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's places, 1 sigma, µm.
 
     Places are those of the used sinusoids of x and then of y. Each frame is compared with the light that the other
     axis saw: in that of its own axis it leaves waves, which would hide a tenth of what differs. Phases `phase_rad`

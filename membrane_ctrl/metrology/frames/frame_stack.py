@@ -170,7 +170,7 @@ def pixel_phases(
     index : (n,) int array
         Pixels, counted row by row.
     sensitivity_rad_per_um : (n,) array
-        Change of phase per um of displacement; zeros if no motion is corrected.
+        Change of phase per µm of displacement; zeros if no motion is corrected.
     reference_rad : (n,) array
         Absolute phase to within half a period; not changed.
     gain : (N, height) array, optional

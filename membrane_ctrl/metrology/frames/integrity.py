@@ -142,13 +142,13 @@ def _summary(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
     return Closure(rms, np.sqrt(np.mean(residual**2, axis=1)), without)
 
 
-# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 um of motion) differ by up to 0.005 rad of step
-# and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 um of figure.
+# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 µm of motion) differ by up to 0.005 rad of step
+# and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 µm of figure.
 STEP_RAD = 0.03
 LEVEL_SHARE = 0.05
 SWING_SHARE = 0.05
 _FLICKER = 0.03  # of light is called flicker whatever else is wrong
-# A frame taken 15 um off bends the figure by a few um at most; lasers are commonly off by less.
+# A frame taken 15 µm off bends the figure by a few µm at most; lasers are commonly off by less.
 MOVED_UM = 15.0
 REST_SHARE = 0.015
 SATURATED_SHARE = 0.02
@@ -298,7 +298,7 @@ def _sinusoid_defect(kind: str, e: Evidence, level: float, moved_um: float) -> t
         return FrameDefect.FLICKER, f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
         away_um = e.moved_um - moved_um
-        return FrameDefect.MOVED, f"moved: the film was {away_um:+.0f} um from where the others saw it"
+        return FrameDefect.MOVED, f"moved: the film was {away_um:+.0f} µm from where the others saw it"
     if kind == "step":
         return FrameDefect.WRONG_PICTURE, f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
     return FrameDefect.DIFFERS, f"differs from its prediction by {e.rest:.1%} of the light"

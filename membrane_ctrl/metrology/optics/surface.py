@@ -228,7 +228,7 @@ class SeenScreen:
 # The radial profile against Hencky's bowl, and the pressure that belongs to it.
 
 
-# The paper's mirror film (PET, 50 um): its sag gives the pressure, p = E t / a (w0 / (0.653 a))^3
+# The paper's mirror film (PET, 50 µm): its sag gives the pressure, p = E t / a (w0 / (0.653 a))^3
 _YOUNG_PA = 4.1e9
 _THICKNESS_MM = 0.05
 _CENTRE = 0.65344  # w0 / (a q^(1/3)) for a Poisson ratio of 0.3

@@ -293,7 +293,7 @@ class LostOrders:
         tilt_um, odd_um = np.hypot(self._lost_um[:, 0], self._lost_um[:, 1]), self.odd_um(self._lost_um)
         least = int(np.argmin(odd_um**2 + (tilt_um / 150.0) ** 2))
         raise ValueError(
-            f"a lost period looks like a tilt of {tilt_um[least]:.0f} um RMS with {odd_um[least]:.1f} um of "
+            f"a lost period looks like a tilt of {tilt_um[least]:.0f} µm RMS with {odd_um[least]:.1f} µm of "
             "other terms, as if the mirror had moved: use a longer period"
         )
 
@@ -312,12 +312,12 @@ class LostOrders:
             return Finding(
                 "rejected",
                 "order lost: the mirror moved by a period or more since the last good frame, or changed its shape "
-                f"(tilt {tilt_um:.0f} um RMS, other terms {odd_um:.1f})",
+                f"(tilt {tilt_um:.0f} µm RMS, other terms {odd_um:.1f})",
                 lost=True,
             )
         sag_um = float(surface.sag_gradient() @ change_um)
         if abs(sag_um - displacement_um) > _LASER_UM:
-            return Finding("rejected", f"the sag changed by {sag_um:.0f} um, which the laser did not see", True)
+            return Finding("rejected", f"the sag changed by {sag_um:.0f} µm, which the laser did not see", True)
         return None
 
     def sure(self, change_um: FloatArray, passed_s: float) -> bool:

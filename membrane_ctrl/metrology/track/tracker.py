@@ -24,7 +24,7 @@ _FAR_OFF = 0.05  # over the swing: dust that moved is no lost order
 _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
-_KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 urad
+_KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 µrad
 _BLIND_NOISE_ADU = 0.01  # with less, frames of a still mirror may be the same; here a pixel in 90 differs
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
 _SIGMA_EVERY_S = 2.5  # errors change slowly, and the covariance costs as much as eight fits
@@ -148,7 +148,7 @@ class Tracker:
         """Of the parameters (parameters,), from the mean place in the last five steps to that in these.
 
         The mean of five steps is free of the errors of each. Taken from the steps themselves, a drift was lost in
-        these errors: 0.1 um in a cycle of five became a saw-tooth of as much.
+        these errors: 0.1 µm in a cycle of five became a saw-tooth of as much.
         """
         if self._mean_place is None:
             return np.zeros(surface.PARAMETERS)
@@ -323,7 +323,7 @@ class Tracker:
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
             self._knocked = (
-                f"knocked: the figure tilted by {urad:.0f} urad at {time_s:.2f} s; check camera and screen"
+                f"knocked: the figure tilted by {urad:.0f} µrad at {time_s:.2f} s; check camera and screen"
             )
         return Finding("degraded", self._knocked, True) if self._knocked else None
 

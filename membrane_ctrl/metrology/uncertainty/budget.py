@@ -213,7 +213,7 @@ def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
 
 
 def moves_mm(bench: TrialBench) -> FloatArray:
-    """Change (2, n) of the screen points per um of the film's displacement."""
+    """Change (2, n) of the screen points per µm of the film's displacement."""
     tracer, points = _stand(bench, bench.geometry().geometry)
     return motion.sensitivity_mm_per_um(tracer, points, bench.surface)
 
@@ -251,12 +251,12 @@ class FrameEffects:
 
     level: FloatArray  # its light, relative
     swing: FloatArray  # the amplitude of its fringes and of their harmonics, relative
-    film: FloatArray  # the film's place, um; the figure is that of the mean place
+    film: FloatArray  # the film's place, µm; the figure is that of the mean place
     display: FloatArray  # the same of the fringes' harmonics alone
 
     @property
     def x_to_y(self) -> FloatArray:
-        """(parameters,) per um of the film's motion from the x to the y frames."""
+        """(parameters,) per µm of the film's motion from the x to the y frames."""
         x, y = np.split(self.film, 2, axis=1)
         return np.asarray((y.sum(axis=1) - x.sum(axis=1)) / 2)
 

@@ -49,13 +49,13 @@ class LiveErrors:
     """Sensitivities of the surface's parameters, in mm."""
 
     frames: budget.FrameEffects
-    vertex: FloatArray  # (parameters,): per um of the vertex' place
+    vertex: FloatArray  # (parameters,): per µm of the vertex' place
     # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or too wide
     common_mm2: FloatArray
-    # (parameters, parameters): covariance of what is left of that in a change, per um^2 of the film's displacement
+    # (parameters, parameters): covariance of what is left of that in a change, per µm^2 of the film's displacement
     # between the cycles
     per_um2: FloatArray
-    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be 1 um deeper in x
+    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be 1 µm deeper in x
     # than in y
     told_um2: FloatArray
 
@@ -286,7 +286,7 @@ def frames_seen(
     told_um : (2, N) array
         Place of the film about its mean, as the phases were corrected for.
     sensitivity_rad_per_um : (2, n) array
-        Change of phase per um of displacement.
+        Change of phase per µm of displacement.
     """
     scenes, out, waves = weights @ means, [], []
     for axis, frames in enumerate(means):

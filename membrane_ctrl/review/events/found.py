@@ -112,7 +112,7 @@ def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
     spans = [(float(time_s[g.first]), float(time_s[g.last])) for g in found]
     return [
         steps.FoundEvent(
-            "laser glitch", a_s, a_s - 30, b_s + 30, g.size_um, "um", steps.confidence(g.sigmas, time_s.size)
+            "laser glitch", a_s, a_s - 30, b_s + 30, g.size_um, "µm", steps.confidence(g.sigmas, time_s.size)
         )
         for g, (a_s, b_s) in zip(found, spans, strict=True)
     ]

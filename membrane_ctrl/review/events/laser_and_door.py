@@ -8,7 +8,7 @@ from scipy import ndimage
 from membrane_ctrl.model.arrays import BoolArray, Column, IntArray
 from membrane_ctrl.review.events.steps import FoundStep, differences, local_sigma
 
-# A laser's noise is 1 um; the film cannot make a spike of a single tick.
+# A laser's noise is 1 µm; the film cannot make a spike of a single tick.
 GLITCH_LEAST_UM = 4.0
 GLITCH_LEAST_SIGMAS = 8.0
 # Longer ones the loop follows and the camera contradicts.
@@ -17,14 +17,14 @@ GLITCH_LONGEST_S = 60
 _BASE_S = 7
 # A glitch within a second leaves the mirror where it was.
 _MOVED_MOST = 0.3
-# Both edges have the same size, except for the loop's action within two seconds: up to 4 um/s.
+# Both edges have the same size, except for the loop's action within two seconds: up to 4 µm/s.
 _EDGES_ALIKE = 0.5
 _EDGE_S = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Glitch:
-    """A reading that was not the mirror's: first and last row, um, and sigmas above the noise."""
+    """A reading that was not the mirror's: first and last row, µm, and sigmas above the noise."""
 
     first: int
     last: int

@@ -127,7 +127,7 @@ def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
-# After the cause: the time for the loop to return to the band (a leak of 1.2 um/s and 40 um: 32 s).
+# After the cause: the time for the loop to return to the band (a leak of 1.2 µm/s and 40 µm: 32 s).
 BACK_S = 30
 # Means of this many seconds distinguish a ramping setpoint from noise.
 RAMP_HALF_S = 5
@@ -153,7 +153,7 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
     for a, b in runs(out, BACK_S):
         worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
         found.append(FoundEvent("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
-                           float(error_um[worst]), "um", 1.0))  # fmt: skip
+                           float(error_um[worst]), "µm", 1.0))  # fmt: skip
     return found
 
 
@@ -185,6 +185,6 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     best = [int(group[np.argmax(size[group])]) for group in groups]
     time_s = {"time_s": shapes.time_s[good]}
     return [
-        event_around("shape jump", time_s, row, 60, float(size[row]), "um", confidence(float(score[row]), size.size))
+        event_around("shape jump", time_s, row, 60, float(size[row]), "µm", confidence(float(score[row]), size.size))
         for row in best
     ]

@@ -43,12 +43,12 @@ class ErrorSeries:
     spectrum: spectra.Spectrum  # of the ticks
     # Of the 1 s means, in segments of half the hold: for motion slower than the segments of `spectrum`
     slow: spectra.Spectrum
-    drift: FittedSlope  # um per hour
+    drift: FittedSlope  # µm per hour
 
 
 @dataclass(frozen=True, slots=True)
 class Benefit:
-    """Feed-forward: std of the 1 s means as held, and as they would have been without it (um)."""
+    """Feed-forward: std of the 1 s means as held, and as they would have been without it (µm)."""
 
     with_um: float
     without_um: float
@@ -270,7 +270,7 @@ def _anomalies(
         if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
             odd.append(Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band"))
         if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
-            odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} um on average"))
+            odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
         if series.drift.significant:
             odd.append(Anomaly("drift", _of(series.drift, "um/h")))
     if ticks.paused_s:
@@ -284,7 +284,7 @@ def _anomalies(
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
-        odd.append(Anomaly("too tight", f"a leak of {leak_um_per_s:.2f} um/s leaves the pump no way to lower"))
+        odd.append(Anomaly("too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"))
     if ticks.pump.saturated_share > _SATURATED_MOST:
         odd.append(Anomaly("saturation", f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow"))
     untracked_s = (1 - tracking_share) * ticks.hold_s

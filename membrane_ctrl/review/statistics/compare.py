@@ -145,7 +145,7 @@ def _tracks(analysis: Analysis) -> bool:
 
 
 def _reference_um(analysis: Analysis) -> float:
-    """Standard error (um) of the shape loop's reference, an offset of the true centre for the whole run.
+    """Standard error (µm) of the shape loop's reference, an offset of the true centre for the whole run.
 
     From the observed scatter of sag minus laser between cycles; 0 if the loop does not track or there are
     too few cycles.

@@ -181,10 +181,10 @@ def _lines(table: dict[str, Any]) -> list[str]:
         f"runs       {len(table['runs'])}, over {table['hours']:.1f} h; each reading scatters by "
         f"{table['scatter_percent']:.2g} %",
         f"E t        {table['stiffness_n_per_m'] / 1e3:.2f} kN/m, if the pre-strain is "
-        f"{1e6 * table['prestrain']:g} um/m and nu {table['poisson']:g}",
+        f"{1e6 * table['prestrain']:g} µm/m and nu {table['poisson']:g}",
         creeps if table["creeps"] else "creep      none that these readings show",
-        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} um in 24 h; 95 %: {low:+.3g} to "
-        f"{high:+.3g} um, without the weather",
+        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} µm in 24 h; 95 %: {low:+.3g} to "
+        f"{high:+.3g} µm, without the weather",
     ]
 
 

@@ -39,7 +39,7 @@ class ThinSeconds:
         self._parts.append((second[starts][thin], sums[:, thin]))
 
     def result(self) -> tuple[spectra.Seconds, Column]:
-        """(k,) thin seconds with all ticks settled, (k,) their mean setpoint in um."""
+        """(k,) thin seconds with all ticks settled, (k,) their mean setpoint in µm."""
         if not self._parts:
             return np.empty(0, dtype=np.int32), np.empty(0)
         second = np.concatenate([part[0] for part in self._parts])
@@ -53,7 +53,7 @@ class ThinSeconds:
 
 @dataclass(frozen=True, slots=True)
 class LevelMeans:
-    """Means of (k,) thin seconds from the level: their ticks, errors in um, NaN where missing."""
+    """Means of (k,) thin seconds from the level: their ticks, errors in µm, NaN where missing."""
 
     second: spectra.Seconds
     ticks: Column

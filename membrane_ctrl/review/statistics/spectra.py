@@ -137,7 +137,7 @@ class WithoutFeedforward:
         self._state = np.zeros(2)
 
     def kept_away_um(self, feedforward_um_per_s: Column) -> Column:
-        """(n,) um by which the error would have been larger; gaps count as zero flow."""
+        """(n,) µm by which the error would have been larger; gaps count as zero flow."""
         flow = np.nan_to_num(np.asarray(feedforward_um_per_s, dtype=np.float64))
         kept, self._state = signal.lfilter(self._numerator, self._denominator, flow, zi=self._state)
         return np.asarray(kept, dtype=np.float64)

@@ -60,7 +60,7 @@ OVERVIEWS = tuple(stream for plot in plots_of(*DRAWN) for stream in overview_str
 _COLOUR_WORDS = (
     "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
 )
-_SIGNED = {"Pa", "um", "%"}
+_SIGNED = {"Pa", "µm", "%"}
 _OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
 _FOUND_COLOURS = {
     "pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE,

@@ -230,7 +230,7 @@ class OpticsRenderer:
         return maps
 
     def _swing_maps(self, mode: DrumMode) -> FloatArray:
-        """Change of the maps at the nodes by 1 um of a mode: linear to 1e-4 of it, at any displacement."""
+        """Change of the maps at the nodes by 1 µm of a mode: linear to 1e-4 of it, at any displacement."""
         if mode not in self._swings:
             still, moved = (
                 self._maps(self._trace(self._directions, 0.0, film))

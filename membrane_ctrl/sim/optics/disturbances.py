@@ -39,7 +39,7 @@ class DrumMode:
         return np.asarray(1e-3 * self.amplitude_nm * np.sin(2 * math.pi * self.frequency_hz * time_s + self.lobes))
 
     def moved(self, film: FilmShape) -> FilmTerms:
-        """The film displaced by 1 um RMS, its ring at rest."""
+        """The film displaced by 1 µm RMS, its ring at rest."""
         from scipy import special
 
         m, terms, zero = self.lobes, film.terms_at(0.0), special.jn_zeros(self.lobes, self.circles)[-1]

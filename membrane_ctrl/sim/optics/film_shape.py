@@ -312,7 +312,7 @@ def typical_film(
     """A mounted film: a Hencky bowl with the figure errors of clamping by hand.
 
     0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the seed,
-    and 10 um RMS spread over the terms above.
+    and 10 µm RMS spread over the terms above.
     """
     rng = np.random.default_rng(seed)
     coeffs_um = np.zeros(_TYPICAL_TERMS)

@@ -20,7 +20,7 @@ FaultKind = Literal[
     "stale", "swapped", "missing", "saturated", "dark", "flicker", "moved", "wrong_size", "wrong_depth"
 ]
 
-# Strength of a fault: relative exposure, or um of film displacement
+# Strength of a fault: relative exposure, or µm of film displacement
 _DEFAULT_AMOUNT: dict[FaultKind, float] = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8, "moved": 200.0}
 
 
@@ -33,7 +33,7 @@ class FrameFault:
     # laser), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit or the reverse)
     kind: FaultKind
     frame: str  # the frame's name, as `x_sin_2`
-    amount: float | None = None  # relative exposure, or um for "moved"; None: a typical one
+    amount: float | None = None  # relative exposure, or µm for "moved"; None: a typical one
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(FaultKind):
